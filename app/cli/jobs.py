@@ -1,0 +1,87 @@
+"""One job run by the command line itself: the same store and runner as the service, with a progress bar."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from app.bootstrap import Service, running_service
+from app.cli.console import WorkFailed
+from app.documents import JobRequest
+from app.engines import Engines
+from app.events import TERMINAL_KINDS, message
+from app.settings import Settings
+from calibration.tables import LensTable
+from storage.errors import NotFound
+from storage.records import JobState, PictureKind
+
+_LOOK_AGAIN_S = 5.0
+# Events wake the listener; this only bounds the wait if a wake-up were ever missed.
+
+Show = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedJob:
+    """A job that left a table; ``pictures`` by level (zoom, focus) and kind."""
+
+    job_id: str
+    table: LensTable
+    pictures: dict[tuple[float, float], dict[PictureKind, bytes]]
+
+
+async def run_job(settings: Settings, engines: Engines, request: JobRequest, show: Show) -> FinishedJob:
+    """Run a job to its end. Raises WorkFailed with the job's reason.
+
+    Interrupted, it cancels the job first: the engine gets its values back and finished levels stay in the store.
+    """
+    async with running_service(settings, engines) as service:
+        record = await service.runner.submit(request)
+        try:
+            await _follow(service, record.id, len(request.levels), show)
+        except asyncio.CancelledError:
+            await service.runner.cancel(record.id)
+            raise
+        record = await service.repository.get_job(record.id)
+        if record.state is not JobState.DONE:
+            raise WorkFailed(f"the job {record.state.value}: {record.reason}")
+        summary = await service.repository.table_of_job(record.id)
+        if summary is None:
+            raise WorkFailed(f"job {record.id} is done but left no table; the store may have been changed meanwhile")
+        table = (await service.repository.get_table(summary.id)).table
+        return FinishedJob(record.id, table, await _pictures(service, record.id))
+
+
+async def _follow(service: Service, job_id: str, levels: int, show: Show) -> None:
+    seen, done, share, level = 0, 0, 0.0, ""
+    with service.broker.listen(job_id) as wakeups:
+        while True:
+            wakeups.clear()
+            for record in await service.repository.events_after(job_id, seen):
+                seen = record.seq
+                event = message(record)
+                kind = event["kind"]
+                if kind == "level_started":
+                    level, share = f"zoom {event['zoom']:.3g} focus {event['focus']:.3g}", 0.0
+                elif kind == "level_progress":
+                    share = event["progress"]
+                elif kind in ("level_done", "level_failed"):
+                    done, share = done + 1, 0.0
+                doing = f"level {min(done + 1, levels)}/{levels}: {level}" if level else "measuring the output's delay"
+                show((done + share) / levels, doing)
+                if kind in TERMINAL_KINDS:
+                    return
+            await wakeups.wait(_LOOK_AGAIN_S)
+
+
+async def _pictures(service: Service, job_id: str) -> dict[tuple[float, float], dict[PictureKind, bytes]]:
+    found: dict[tuple[float, float], dict[PictureKind, bytes]] = {}
+    for level in await service.repository.list_levels(job_id):
+        kinds: dict[PictureKind, bytes] = {}
+        for kind in PictureKind:
+            with contextlib.suppress(NotFound):  # not every level has every kind
+                kinds[kind] = (await service.repository.get_picture(job_id, level.ordinal, kind)).data
+        found[(level.result.zoom, level.result.focus)] = kinds
+    return found

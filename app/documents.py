@@ -1,0 +1,217 @@
+"""The documents that people write: picture sets and jobs, checked field by field.
+
+A mistake becomes one line: which field, what is wrong with it, what to write instead. Names, units and meanings
+are those of ``docs/reference``. Fields that are not known are refused in a job (a misspelt option must not be
+ignored) and kept out of the way in a picture set (other tools add their own).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from calibration.errors import CalibrationError
+from calibration.types import CameraPose, Role, Target, TargetKind, TargetPose
+
+MAX_DOCUMENT_BYTES = 16 * 1024 * 1024
+"""Largest JSON document read: a set of 100,000 pictures stays below it."""
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Side = Annotated[int, Field(ge=16, le=32768)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Unit = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+class DocumentError(Exception):
+    """A document that cannot be used. One line: which file, which field, what is wrong."""
+
+
+class _Loose(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TargetPoseModel(_Loose):
+    """Where a target stands (see ``docs/explanations/conventions.md``); ``sigma_*`` missing: exact."""
+
+    centre_m: tuple[Finite, Finite, Finite]
+    yaw_deg: Finite = 0.0
+    pitch_deg: Finite = 0.0
+    roll_deg: Finite = 0.0
+    sigma_m: NotNegative = 0.0
+    sigma_deg: NotNegative = 0.0
+
+
+class TargetModel(_Loose):
+    """A target: ``chessboard`` (``squares``, ``square_m``), ``square`` (``size_m``) or ``light`` (``diameter_m``)."""
+
+    kind: TargetKind
+    squares: tuple[int, int] | None = None
+    square_m: Positive | None = None
+    size_m: tuple[Positive, Positive] | None = None
+    diameter_m: Positive | None = None
+    colours: tuple[str, ...] = ()
+    pose: TargetPoseModel | None = None
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> TargetModel:
+        try:
+            self.to_target()
+        except CalibrationError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    def to_target(self) -> Target:
+        pose = None
+        if self.pose is not None:
+            given = self.pose
+            pose = TargetPose(
+                given.centre_m, given.yaw_deg, given.pitch_deg, given.roll_deg, given.sigma_m, given.sigma_deg
+            )
+        return Target(self.kind, self.squares, self.square_m, self.size_m, self.diameter_m, tuple(self.colours), pose)
+
+
+class CameraPoseModel(_Loose):
+    """Where the camera's pivot stood and how it was turned; ``sigma_*`` missing: exact."""
+
+    pivot_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    pan_deg: Finite = 0.0
+    tilt_deg: Finite = 0.0
+    roll_deg: Finite = 0.0
+    sigma_m: NotNegative = 0.0
+    sigma_deg: NotNegative = 0.0
+
+    def to_pose(self) -> CameraPose:
+        return CameraPose(self.pivot_m, self.pan_deg, self.tilt_deg, self.roll_deg, self.sigma_m, self.sigma_deg)
+
+
+class PictureModel(_Loose):
+    """One picture of a set, and what is known of it."""
+
+    file: Name
+    zoom: Finite = 0.0
+    focus: Finite = 0.0
+    target: Name
+    role: Role = Role.FREE
+    camera_pose: CameraPoseModel | None = None
+
+
+class PictureSet(_Loose):
+    """``set.json`` of a folder of pictures."""
+
+    picture_set: Literal[1]
+    lens: Name = "unnamed lens"
+    camera: Name = "unnamed camera"
+    image_size: tuple[Side, Side]
+    sensor_mm: tuple[Positive, Positive] | None = None
+    pixel_aspect: Positive = 1.0
+    transfer: Literal["bt709", "srgb", "linear"] | None = None
+    targets: dict[str, TargetModel] = Field(min_length=1)
+    pictures: list[PictureModel] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _targets_exist(self) -> PictureSet:
+        for index, picture in enumerate(self.pictures):
+            if picture.target not in self.targets:
+                known = ", ".join(sorted(self.targets))
+                raise ValueError(f"pictures[{index}].target {picture.target!r} is not in targets ({known})")
+        return self
+
+
+class LevelModel(_Strict):
+    """One level: encoder values 0..1 (zoom 0 wide, 1 tele; focus 0 infinity, 1 near)."""
+
+    zoom: Unit
+    focus: Unit
+
+
+class JobRequest(_Strict):
+    """A calibration job for an engine: which lens, which levels, what stands in the room."""
+
+    job: Literal[1] = 1
+    lens: Name
+    camera: Name = "Cam0"
+    engine: Name = Field(default="default", description="name of the studio profile's engine; one job at a time on it")
+    method: Literal["joint", "alternating"] = "joint"
+    image_size: tuple[Side, Side] = (1920, 1080)
+    sensor_mm: tuple[Positive, Positive] | None = None
+    pixel_aspect: Positive = 1.0
+    levels: list[LevelModel] = Field(min_length=1, max_length=1000)
+    targets: dict[str, TargetModel] = Field(min_length=1, description="surveyed targets: each needs its pose")
+    pivot_m: tuple[Finite, Finite, Finite] = Field(description="where the camera's pivot stands")
+    pivot_sigma_m: NotNegative = 0.0
+    angle_sigma_deg: NotNegative = Field(default=0.0, description="the head's encoders, one sigma")
+    goal_px: Positive = Field(default=0.03, description="largest expected overlay error at which pictures stop")
+    max_views: Annotated[int, Field(ge=2, le=100)] = 12
+
+    @model_validator(mode="after")
+    def _can_be_measured(self) -> JobRequest:
+        for name, target in self.targets.items():
+            if target.pose is None:
+                raise ValueError(f"targets.{name}.pose is missing: an engine's target needs its surveyed place")
+        seen: set[tuple[float, float]] = set()
+        for index, level in enumerate(self.levels):
+            if (level.zoom, level.focus) in seen:
+                raise ValueError(f"levels[{index}] (zoom {level.zoom:g}, focus {level.focus:g}) is listed twice")
+            seen.add((level.zoom, level.focus))
+        return self
+
+
+def one_line(error: ValidationError) -> str:
+    """The first thing wrong with a document, as ``field: what``, and how many more there are."""
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    field = ".".join(str(part) for part in first["loc"])
+    message = str(first["msg"]).removeprefix("Value error, ")
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{field}: {message}{more}" if field else f"{message}{more}"
+
+
+def _read_json(path: Path) -> object:
+    try:
+        if path.stat().st_size > MAX_DOCUMENT_BYTES:
+            raise DocumentError(
+                f"{path}: larger than {MAX_DOCUMENT_BYTES // 2**20} MiB; this is not a document of ours"
+            )
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DocumentError(f"{path}: no such file") from error
+    except IsADirectoryError as error:
+        raise DocumentError(f"{path}: is a folder, not a file") from error
+    except UnicodeDecodeError as error:
+        raise DocumentError(f"{path}: not a UTF-8 text file") from error
+    except OSError as error:
+        raise DocumentError(f"{path}: cannot be read ({error.strerror or error})") from error
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DocumentError(f"{path}: not JSON, line {error.lineno} column {error.colno}: {error.msg}") from error
+    except RecursionError as error:
+        raise DocumentError(f"{path}: nested too deeply; this is not a document of ours") from error
+
+
+def read_picture_set(folder: Path) -> PictureSet:
+    """The picture set in ``folder`` (or the ``set.json`` itself). Raises :class:`DocumentError`."""
+    path = folder / "set.json" if folder.is_dir() else folder
+    if not path.exists() and folder.suffix != ".json":
+        raise DocumentError(f"{folder}: no such folder; a picture set is a folder with a set.json")
+    try:
+        return PictureSet.model_validate(_read_json(path))
+    except ValidationError as error:
+        raise DocumentError(f"{path}: {one_line(error)}") from error
+
+
+def read_job(path: Path) -> JobRequest:
+    """The job in ``path``. Raises :class:`DocumentError`."""
+    try:
+        return JobRequest.model_validate(_read_json(path))
+    except ValidationError as error:
+        raise DocumentError(f"{path}: {one_line(error)}") from error

@@ -1,0 +1,161 @@
+"""The engines that this service may use, and the lease: one engine, one user at a time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from app.errors import ServiceError
+from calibration.image import Transfer
+from engine_adapters.errors import AdapterError
+from engine_adapters.ports import CameraHead, EngineState, FrameSource, RenderEngine
+
+RESTORE_BOUND_S = 15.0
+"""Longest wait for an engine to take its values back: three commands with their own time-outs and one reopening."""
+
+
+class EngineError(ServiceError):
+    """Base: an engine that cannot be leased."""
+
+
+class UnknownEngine(EngineError):
+    """No engine of that name. The message lists those there are."""
+
+
+class EngineInUse(EngineError):
+    """Another job holds the engine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Studio:
+    """What a job talks to: an engine, its output, and what turns the camera. ``transfer``: how pictures code light."""
+
+    engine: RenderEngine
+    frames: FrameSource
+    head: CameraHead
+    transfer: Transfer = Transfer.BT709
+
+    async def close(self) -> None:
+        """Release every connection."""
+        async with AsyncExitStack() as stack:
+            for port in (self.engine, self.frames, self.head):
+                stack.push_async_callback(port.close)
+
+
+@dataclass(frozen=True, slots=True)
+class EngineInfo:
+    """An engine as shown to clients. ``dirty``: why its values may not be as they were found, or None."""
+
+    name: str
+    address: str
+    job_id: str | None
+    dirty: str | None
+
+
+@dataclass(slots=True)
+class _Slot:
+    address: str
+    connect: Callable[[], Studio]
+    job_id: str | None = None
+    dirty: str | None = None
+    found: EngineState | None = None
+
+
+@dataclass(slots=True)
+class Lease:
+    """An engine held by one job. Values as found are put back when the lease ends."""
+
+    studio: Studio
+    found: EngineState
+    restored: bool = False
+    problem: str | None = None
+
+
+class Engines:
+    """The engines by name; each is leased to one job at a time."""
+
+    def __init__(self) -> None:
+        self._slots: dict[str, _Slot] = {}
+
+    def add(self, name: str, address: str, connect: Callable[[], Studio]) -> None:
+        """Make an engine known. ``connect`` makes its adapters; connections are opened at their first use."""
+        self._slots[name] = _Slot(address, connect)
+
+    def names(self) -> Iterable[str]:
+        return tuple(self._slots)
+
+    def infos(self) -> list[EngineInfo]:
+        return [EngineInfo(name, slot.address, slot.job_id, slot.dirty) for name, slot in self._slots.items()]
+
+    def require(self, name: str) -> None:
+        """Raise :class:`UnknownEngine` unless there is an engine of this name."""
+        if name not in self._slots:
+            known = ", ".join(sorted(self._slots)) or "none"
+            raise UnknownEngine(f"no engine is called {name!r}; this service knows: {known}")
+
+    @asynccontextmanager
+    async def lease(self, name: str, job_id: str) -> AsyncIterator[Lease]:
+        """Hold an engine; on leaving, however that happens, its values are put back as they were found.
+
+        Raises :class:`UnknownEngine`, :class:`EngineInUse`, or the adapters' errors when the engine is not there. The
+        lease object then tells whether the values could be put back (``restored``, ``problem``); if not, the engine
+        is dirty and the next lease puts them back first.
+        """
+        self.require(name)
+        slot = self._slots[name]
+        if slot.job_id is not None:
+            raise EngineInUse(f"engine {name!r} is in use by job {slot.job_id}")
+        slot.job_id = job_id
+        try:
+            studio = slot.connect()
+            try:
+                lease = await self._begin(slot, studio)
+                try:
+                    yield lease
+                finally:
+                    await _finish_shielded(self._end(slot, lease))
+            finally:
+                await studio.close()
+        finally:
+            slot.job_id = None
+
+    async def _begin(self, slot: _Slot, studio: Studio) -> Lease:
+        if slot.found is not None:
+            await studio.engine.restore(slot.found)
+            slot.found, slot.dirty = None, None
+        return Lease(studio, await studio.engine.read_state())
+
+    async def _end(self, slot: _Slot, lease: Lease) -> None:
+        try:
+            async with asyncio.timeout(RESTORE_BOUND_S):
+                for attempt in (1, 2):
+                    try:
+                        await lease.studio.engine.restore(lease.found)
+                        break
+                    except AdapterError:
+                        # The first try may meet a connection that a cancelled exchange has closed.
+                        if attempt == 2:
+                            raise
+            lease.restored = True
+        except (AdapterError, TimeoutError) as error:
+            lease.problem = str(error) or f"not within {RESTORE_BOUND_S:g} s"
+            slot.found, slot.dirty = lease.found, lease.problem
+
+
+async def _finish_shielded(work: Coroutine[Any, Any, None]) -> None:
+    """Await a bounded coroutine to its end even if the caller is cancelled meanwhile; re-raise the cancellation."""
+    task = asyncio.create_task(work)
+    cancelled: asyncio.CancelledError | None = None
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError as error:
+            if task.cancelled():
+                raise
+            cancelled = error
+    task.result()
+    if cancelled is not None:
+        raise cancelled

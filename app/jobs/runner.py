@@ -1,0 +1,324 @@
+"""The job runner: queued jobs run one after another on each engine, level by level, each level committed as it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+from app.documents import JobRequest
+from app.engines import EngineError, EngineInfo, Engines, Lease
+from app.errors import QueueFull
+from app.events import (
+    AnyEvent,
+    EngineDirty,
+    EngineRestored,
+    EventBroker,
+    JobCancelled,
+    JobCancelling,
+    JobDone,
+    JobFailed,
+    JobQueued,
+    JobStarted,
+    LevelDone,
+    LevelFailed,
+    LevelStarted,
+    Note,
+    draft,
+    make,
+)
+from app.jobs.cpu import Cpu
+from app.jobs.level import LevelOutcome, LevelRun
+from app.jobs.pictures import level_pictures
+from app.jobs.state import sources
+from app.jobs.sweep import guess_from, level_task, order
+from app.jobs.taking import PictureTaker
+from calibration.errors import CalibrationError
+from calibration.solve.alternating import AlternatingMethod
+from calibration.solve.joint import JointMethod, JointOptions
+from calibration.solve.search import LevelMethod, LevelTask
+from calibration.tables import LensTable, LevelResult, LevelStatus
+from engine_adapters.errors import AdapterError
+from storage.errors import StorageError
+from storage.records import JobRecord, JobState
+from storage.repository import Repository
+
+log = logging.getLogger("lensmatch.jobs")
+
+_STUDIO_FAILURES = 2
+# Levels in a row that the studio failed (engine gone, output dead) before the job gives up: the rest would fail too.
+_HOME_BOUND_S = 20.0
+# Longest wait for head and lens to go back to where they stood; it is a courtesy, not part of the result.
+
+
+@dataclass(slots=True)
+class _Worker:
+    queue: asyncio.Queue[str] = field(default_factory=asyncio.Queue)
+    loop: asyncio.Task[None] | None = None
+    job_id: str | None = None
+    job: asyncio.Task[None] | None = None
+
+
+def make_method(request: JobRequest, task: LevelTask) -> LevelMethod:
+    """The method that a job asks for."""
+    if request.method == "alternating":
+        return AlternatingMethod(task)
+    options = JointOptions(goal_px=request.goal_px, max_views=request.max_views)
+    return JointMethod(task, options)
+
+
+class JobRunner:
+    """Owns one worker task per engine. Start it with ``async with``; leaving ends what runs and keeps what is done."""
+
+    def __init__(
+        self,
+        repository: Repository,
+        engines: Engines,
+        broker: EventBroker,
+        cpu: Cpu,
+        now: Callable[[], datetime],
+        *,
+        queue_limit: int = 100,
+        retry_after_s: int = 30,
+    ) -> None:
+        self._repository = repository
+        self._engines = engines
+        self._broker = broker
+        self._cpu = cpu
+        self._now = now
+        self._queue_limit = queue_limit
+        self._retry_after_s = retry_after_s
+        self._workers: dict[str, _Worker] = {}
+
+    async def start(self) -> None:
+        """Take up what an earlier run left: queued jobs wait again, running ones are failed with their levels kept."""
+        for name in self._engines.names():
+            worker = _Worker()
+            worker.loop = asyncio.create_task(self._work(worker), name=f"jobs of engine {name}")
+            self._workers[name] = worker
+        for job in await self._repository.unfinished_jobs():
+            if job.state is JobState.QUEUED and job.engine in self._workers:
+                self._workers[job.engine].queue.put_nowait(job.id)
+            else:
+                await self._fail(job.id, "the service stopped while the job ran; its finished levels are kept")
+
+    async def close(self) -> None:
+        """End the running jobs (engine restored, finished levels kept) and the workers."""
+        for worker in self._workers.values():
+            if worker.loop is not None:
+                worker.loop.cancel()
+        loops = [w.loop for w in self._workers.values() if w.loop is not None]
+        await asyncio.gather(*loops, return_exceptions=True)
+        self._workers.clear()
+
+    async def __aenter__(self) -> JobRunner:
+        await self.start()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.close()
+
+    def engines(self) -> list[EngineInfo]:
+        """The engines as clients see them."""
+        return self._engines.infos()
+
+    async def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobRecord:
+        """Store a job and queue it. Raises UnknownEngine, QueueFull, IdempotencyConflict."""
+        self._engines.require(request.engine)
+        worker = self._workers[request.engine]
+        if sum(w.queue.qsize() for w in self._workers.values()) >= self._queue_limit:
+            raise QueueFull(self._queue_limit, self._retry_after_s)
+        body = request.model_dump(mode="json")
+        event = JobQueued(
+            lens=request.lens,
+            camera=request.camera,
+            engine=request.engine,
+            method=request.method,
+            levels=len(request.levels),
+        )
+        record = await self._repository.create_job(body, request.lens, request.engine, idempotency_key, draft(event))
+        if record.state is JobState.QUEUED and record.last_seq == 1:
+            worker.queue.put_nowait(record.id)
+        self._broker.notify(record.id)
+        return record
+
+    async def cancel(self, job_id: str) -> JobRecord:
+        """End a job at once; a job that has ended is left as it is. Raises NotFound."""
+        record = await self._repository.get_job(job_id)
+        if record.state is JobState.QUEUED:
+            return await self._change(job_id, JobState.CANCELLED, "cancelled before it began", JobCancelled())
+        if record.state is not JobState.RUNNING:
+            return record
+        record = await self._change(job_id, JobState.CANCELLING, None, JobCancelling())
+        for worker in self._workers.values():
+            if worker.job_id == job_id and worker.job is not None:
+                worker.job.cancel()
+        return record
+
+    async def _work(self, worker: _Worker) -> None:
+        while True:
+            job_id = await worker.queue.get()
+            worker.job_id = job_id
+            worker.job = asyncio.create_task(self._run(job_id), name=f"job {job_id}")
+            try:
+                await asyncio.wait([worker.job])
+            finally:
+                if not worker.job.done():
+                    worker.job.cancel()
+                    await asyncio.wait([worker.job])
+                worker.job_id = worker.job = None
+
+    async def _run(self, job_id: str) -> None:
+        """One job from queued to its end; every way out leaves a terminal state and its event."""
+        try:
+            record = await self._repository.get_job(job_id)
+            if record.state is not JobState.QUEUED:
+                return  # cancelled while it waited
+            request = JobRequest.model_validate(dict(record.request))
+            await self._change(
+                job_id, JobState.RUNNING, None, JobStarted(engine=request.engine, levels=len(request.levels))
+            )
+            results = await self._run_on_engine(job_id, request)
+            await self._finish(job_id, request, results)
+        except asyncio.CancelledError:
+            await self._end_cancelled(job_id)
+            raise
+        except (AdapterError, EngineError, CalibrationError) as error:
+            await self._fail(job_id, str(error))
+        except StorageError as error:
+            log.error("job %s: the store failed: %s", job_id, error)
+            await self._fail(job_id, f"the store failed: {error}")
+        except Exception:
+            log.exception("job %s failed by a mistake of ours", job_id)
+            await self._fail(job_id, "internal error; the service's log has the details")
+
+    async def _run_on_engine(self, job_id: str, request: JobRequest) -> list[LevelResult]:
+        lease: Lease | None = None
+        try:
+            async with self._engines.lease(request.engine, job_id) as lease:
+                return await self._levels(job_id, request, lease)
+        finally:
+            if lease is not None and lease.restored:
+                await self._event(job_id, EngineRestored(engine=request.engine))
+            elif lease is not None:
+                await self._event(job_id, EngineDirty(engine=request.engine, reason=lease.problem or "unknown"))
+
+    async def _levels(self, job_id: str, request: JobRequest, lease: Lease) -> list[LevelResult]:
+        taker = PictureTaker(lease.studio, request.image_size, self._cpu)
+        stood = await taker.read_head()
+        await taker.measure_delay()
+        delay_ms, picture_ms = taker.delay.delay_s * 1e3, taker.delay.picture_s * 1e3
+        text = f"the output follows a change after at most {delay_ms:.0f} ms; a picture takes {picture_ms:.0f} ms"
+        await self._event(job_id, Note(text=text))
+        ordered = order([(level.zoom, level.focus) for level in request.levels])
+        results: list[LevelResult] = []
+        failures = 0
+        for ordinal, (zoom, focus) in enumerate(ordered):
+            await self._event(job_id, LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus))
+            task = level_task(request, zoom, focus, guess_from(results, zoom, request))
+            outcome, problem = await self._level(job_id, ordinal, request, task, taker, lease)
+            results.append(outcome.result)
+            await self._commit(job_id, ordinal, outcome, task, request)
+            failures = failures + 1 if problem is not None else 0
+            if problem is not None and failures >= _STUDIO_FAILURES and ordinal + 1 < len(ordered):
+                left = len(ordered) - ordinal - 1
+                raise EngineError(f"{problem} ({failures} levels in a row failed so; {left} levels were not tried)")
+        try:
+            async with asyncio.timeout(_HOME_BOUND_S):
+                await taker.home(stood)
+        except (AdapterError, TimeoutError) as error:
+            await self._event(job_id, Note(text=f"head and lens were not turned back: {error}"))
+        return results
+
+    async def _level(
+        self, job_id: str, ordinal: int, request: JobRequest, task: LevelTask, taker: PictureTaker, lease: Lease
+    ) -> tuple[LevelOutcome, AdapterError | None]:
+        # Each event is a synced commit; they are written beside the pictures, not between them.
+        told: asyncio.Queue[AnyEvent | None] = asyncio.Queue()
+
+        def report(kind: str, data: Mapping[str, Any]) -> None:
+            told.put_nowait(make(kind, ordinal=ordinal, zoom=task.zoom, focus=task.focus, **data))
+
+        async def write() -> None:
+            while (event := await told.get()) is not None:
+                await self._event(job_id, event)
+
+        run = LevelRun(make_method(request, task), task, taker, self._cpu, lease.studio.transfer, report)
+        writer = asyncio.create_task(write(), name=f"events of job {job_id}")
+        try:
+            try:
+                return await run.run(), None
+            finally:
+                told.put_nowait(None)
+                await writer
+        except AdapterError as error:
+            failed = LevelResult.failed(task.zoom, task.focus, str(error))
+            return LevelOutcome(failed, None, None, ()), error
+
+    async def _commit(
+        self, job_id: str, ordinal: int, outcome: LevelOutcome, task: LevelTask, request: JobRequest
+    ) -> None:
+        result = outcome.result
+        event: AnyEvent
+        if result.status is LevelStatus.FAILED:
+            reason = result.reason or "unknown"
+            event = LevelFailed(ordinal=ordinal, zoom=result.zoom, focus=result.focus, reason=reason)
+        else:
+            event = LevelDone.of(ordinal, result)
+        await self._repository.save_level(job_id, ordinal, result, draft(event))
+        self._broker.notify(job_id)
+        files = await self._cpu.run(level_pictures, outcome, task, request.pixel_aspect)
+        for picture_kind, data in files.items():
+            await self._repository.save_picture(job_id, ordinal, picture_kind, "image/jpeg", data)
+
+    async def _finish(self, job_id: str, request: JobRequest, results: list[LevelResult]) -> None:
+        if all(result.status is LevelStatus.FAILED for result in results):
+            reasons = sorted({result.reason or "" for result in results})
+            await self._fail(job_id, f"no level could be measured: {reasons[0]}")
+            return
+        table = LensTable(
+            lens=request.lens,
+            camera=request.camera,
+            version=1,
+            created=self._now(),
+            image_size=request.image_size,
+            method=request.method,
+            levels=tuple(sorted(results, key=lambda r: (r.zoom, r.focus))),
+            sensor_mm=request.sensor_mm,
+            pixel_aspect=request.pixel_aspect,
+        )
+        summary = await self._repository.save_table(job_id, table)
+        await self._change(
+            job_id,
+            JobState.DONE,
+            None,
+            JobDone(table_id=summary.id),
+        )
+
+    async def _end_cancelled(self, job_id: str) -> None:
+        """A cancelled task: the operator's cancel, or the service ending."""
+        record = await self._repository.get_job(job_id)
+        if record.state is JobState.CANCELLING:
+            await self._change(job_id, JobState.CANCELLED, "cancelled; finished levels are kept", JobCancelled())
+        elif record.state is JobState.RUNNING:
+            await self._fail(job_id, "the service stopped while the job ran; its finished levels are kept")
+
+    async def _fail(self, job_id: str, reason: str) -> None:
+        try:
+            await self._change(job_id, JobState.FAILED, reason, JobFailed(reason=reason))
+        except StorageError as error:
+            log.error("job %s could not be marked as failed (%s): %s", job_id, reason, error)
+
+    async def _change(self, job_id: str, state: JobState, reason: str | None, event: AnyEvent) -> JobRecord:
+        record = await self._repository.set_job_state(
+            job_id, state, expected=sources(state), reason=reason, event=draft(event)
+        )
+        self._broker.notify(job_id)
+        return record
+
+    async def _event(self, job_id: str, event: AnyEvent) -> None:
+        await self._repository.append_event(job_id, draft(event))
+        self._broker.notify(job_id)

@@ -1,0 +1,48 @@
+"""In which order the levels of a job are measured, and what a level starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from app.documents import JobRequest
+from calibration.lens import Lens
+from calibration.solve.search import LevelTask
+from calibration.tables import LevelResult, LevelStatus
+
+
+def order(levels: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Zoom by zoom, the focuses there and back again, so that the lens travels little."""
+    by_zoom: dict[float, list[float]] = {}
+    for zoom, focus in levels:
+        by_zoom.setdefault(zoom, []).append(focus)
+    ordered: list[tuple[float, float]] = []
+    for index, zoom in enumerate(sorted(by_zoom)):
+        focuses = sorted(by_zoom[zoom], reverse=index % 2 == 1)
+        ordered += [(zoom, focus) for focus in focuses]
+    return ordered
+
+
+def guess_from(done: Iterable[LevelResult], zoom: float, request: JobRequest) -> Lens | None:
+    """The lens of a finished level at the same zoom: focus changes the view by a few percent only.
+
+    Levels at another zoom are no guess: nothing is known yet of how far the view changes between them.
+    """
+    for result in done:
+        if result.zoom == zoom and result.status is not LevelStatus.FAILED and result.fov_x_deg is not None:
+            return result.lens(request.image_size, request.pixel_aspect)
+    return None
+
+
+def level_task(request: JobRequest, zoom: float, focus: float, guess: Lens | None) -> LevelTask:
+    """What a method must know of one level of a job."""
+    return LevelTask(
+        zoom=zoom,
+        focus=focus,
+        image_size=request.image_size,
+        targets={name: model.to_target() for name, model in request.targets.items()},
+        pivot_m=request.pivot_m,
+        pixel_aspect=request.pixel_aspect,
+        pivot_sigma_m=request.pivot_sigma_m,
+        angle_sigma_deg=request.angle_sigma_deg,
+        guess=guess,
+    )

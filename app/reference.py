@@ -1,0 +1,25 @@
+"""Writes the reference that is made from the code: OpenAPI, event schemas, settings. A test checks that it is current.
+
+``python -m app.reference docs/reference``
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from app import events, main, settings
+
+
+def pages() -> dict[str, str]:
+    """The generated pages by file name."""
+    return {
+        "events.schema.json": events.schema_text(),
+        "openapi.json": main.openapi_text(),
+        "settings.md": settings.reference_text(),
+    }
+
+
+if __name__ == "__main__":
+    for name, text in pages().items():
+        (Path(sys.argv[1]) / name).write_text(text, "utf-8", newline="\n")

@@ -1,0 +1,304 @@
+"""Plain filled quadrilaterals in a picture, roughly: where they are and how well each one is such a thing.
+
+Works on a reduced picture; the corners are good to a pixel or two and only start the fit of the edges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.detect.mask import Channel, ColourField
+from calibration.types import FloatArray
+
+LEAST_SIDE = 5.0
+"""Shortest side, in pixels of the reduced picture, at which a shape can still be told."""
+
+# Largest tilt of the target's plane that is accepted, as its cosine: beyond 60 degrees an edge-on thing of any
+# shape fits, and its corners are poorly determined.
+_LEAST_TILT_COS = 0.5
+_LEAST_FILL = 0.88
+_GRID = 8
+_MOST_SAMPLES = 4000
+_NEXT = np.array([1, 2, 3, 0])
+_BEFORE = np.array([3, 0, 1, 2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quad:
+    """A candidate: ``corners`` (4, 2) clockwise from the top left, reduced pixels.
+
+    ``fill`` overlap of the region with the quadrilateral (0..1), ``tilt_cos`` cosine of the tilt that its shape
+    implies for the target's true proportions, ``side`` length of a square of the same area, ``unevenness`` deviation
+    of its light from a smooth gradient over its mean, ``strength`` and ``purity`` of its colour, ``cut`` whether
+    the frame cuts it.
+    """
+
+    corners: FloatArray
+    fill: float
+    tilt_cos: float
+    unevenness: float
+    strength: float
+    purity: float
+    cut: bool
+    side: float
+
+    @property
+    def score(self) -> float:
+        """How much it is a plain, saturated quadrilateral of the right proportions; only ratios mean anything.
+
+        Shape and evenness decide; colour and size tell apart things that are equal in these, with small powers
+        because lamps and distances change them.
+        """
+        return float(
+            _shape_score(self.fill, self.tilt_cos)
+            * math.exp(-((self.unevenness / 0.12) ** 2))
+            * math.sqrt(self.strength)
+            * self.purity**2
+            * self.side**0.3
+        )
+
+
+def find_quads(
+    field: ColourField, size_m: tuple[float, float], *, frame_edges: tuple[bool, bool, bool, bool]
+) -> list[Quad]:
+    """Candidates in a reduced picture, best first, each place once.
+
+    ``size_m``: the target's width and height. ``frame_edges``: which borders of this field (left, top, right, bottom)
+    are borders of the whole picture; a region that touches another border is no candidate, one that touches
+    a border of the picture is reported as cut.
+    """
+    shapes: list[_Shape] = []
+    seen: set[tuple[int, ...]] = set()
+    for plane, level in field.levels:
+        binary = (plane > level).view(np.uint8)
+        contours, _ = cv2.findContours(binary, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        for outline in contours:
+            contour = np.asarray(outline, dtype=np.int32)
+            if len(contour) < 4 * LEAST_SIDE - 8:
+                continue
+            # A sharp region has the same outline at most levels: one judgement is enough.
+            left, top, width, height = cv2.boundingRect(contour)
+            area = cv2.contourArea(contour)
+            grain = max(2, max(width, height) // 16)
+            box = (left // grain, top // grain, (left + width) // grain, (top + height) // grain)
+            key = (*box, int(25 * math.log(area + 1.0)))
+            if min(width, height) < LEAST_SIDE or key in seen:
+                continue
+            seen.add(key)
+            shape = _shape_of(contour, (left, top, width, height), field.strength.shape, size_m, frame_edges)
+            if shape is not None:
+                _keep_best(shapes, shape)
+    quads = [_with_colour(shape, field) for shape in shapes]
+    return sorted((quad for quad in quads if quad is not None), key=lambda quad: -quad.score)
+
+
+def clockwise_from_top_left(corners: FloatArray) -> FloatArray:
+    """Order four corners clockwise (rows down), beginning with the one that is top left when read upright."""
+    centre = corners.mean(axis=0)
+    angle = np.arctan2(corners[:, 1] - centre[1], corners[:, 0] - centre[0])
+    ordered = corners[np.argsort(angle)]
+    # The top side is the one whose direction is nearest to +u.
+    sides = ordered[_NEXT] - ordered
+    first = int(np.argmax(sides[:, 0] / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)))
+    return np.asarray(ordered[(np.arange(4) + first) % 4], dtype=np.float64)
+
+
+def homography(corners: FloatArray, size_m: tuple[float, float]) -> FloatArray:
+    """Plane (metres, origin at the target's centre, rows down) to pixels, (3, 3), from the four corners clockwise."""
+    half_w, half_h = size_m[0] / 2, size_m[1] / 2
+    plane = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]], dtype=np.float32)
+    return np.asarray(cv2.getPerspectiveTransform(plane, corners.astype(np.float32)), dtype=np.float64)
+
+
+def tilt_cosine(corners: FloatArray, size_m: tuple[float, float]) -> float:
+    """Cosine of the angle between the plane's normal and the line of sight, as the four corners imply it.
+
+    At its centre the picture of the plane is affine, x' = J x; seen from far away (weak perspective) J has the
+    singular values s and s cos(tilt), so their ratio is the cosine, for the target's true width and height.
+    """
+    h = homography(corners, size_m)
+    if not np.isfinite(h).all() or abs(h[2, 2]) < 1e-12:
+        return 0.0
+    h = h / h[2, 2]
+    jacobian = h[:2, :2] - np.outer(h[:2, 2], h[2, :2])
+    # Of a 2 x 2 matrix: s1 s2 = |det|, s1^2 + s2^2 = squared Frobenius norm.
+    total = float(np.sum(jacobian**2))
+    product = abs(float(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
+    root = math.sqrt(max(total * total / 4 - product * product, 0.0))
+    return product / (total / 2 + root) if total > 0 else 0.0
+
+
+def _area(corners: FloatArray) -> float:
+    u, v = corners[:, 0], corners[:, 1]
+    return float(abs(np.dot(u, v[_NEXT]) - np.dot(v, u[_NEXT])) / 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shape:
+    """A quadrilateral outline before its colour is judged (see ``Quad``)."""
+
+    corners: FloatArray
+    centre: tuple[float, float]
+    fill: float
+    tilt_cos: float
+    side: float
+    cut: bool
+
+    @property
+    def score(self) -> float:
+        return _shape_score(self.fill, self.tilt_cos)
+
+
+def _shape_score(fill: float, tilt_cos: float) -> float:
+    return float(math.exp(-(((1.0 - fill) / 0.08) ** 2)) * tilt_cos**1.5)
+
+
+def _keep_best(shapes: list[_Shape], shape: _Shape) -> None:
+    """Add an outline unless a better one stands in the same place; a worse one there goes."""
+    for index, other in enumerate(shapes):
+        apart = math.dist(other.centre, shape.centre)
+        if apart < 0.25 * min(shape.side, other.side) and 0.6 < shape.side / other.side < 1.6:
+            if shape.score > other.score:
+                shapes[index] = shape
+            return
+    shapes.append(shape)
+
+
+def _shape_of(
+    contour: NDArray[np.int32],
+    box: tuple[int, int, int, int],
+    field_shape: tuple[int, ...],
+    size_m: tuple[float, float],
+    frame_edges: tuple[bool, bool, bool, bool],
+) -> _Shape | None:
+    left, top, wide, tall = box
+    height, width = field_shape[:2]
+    touched = (left <= 0, top <= 0, left + wide >= width, top + tall >= height)
+    if any(touch and not border for touch, border in zip(touched, frame_edges, strict=True)):
+        return None
+    hull = np.asarray(cv2.convexHull(contour), dtype=np.int32)
+    # A contour runs through the centres of the outermost pixels, half a pixel inside the region.
+    perimeter = cv2.arcLength(hull, True)
+    area = cv2.contourArea(contour) + cv2.arcLength(contour, True) / 2
+    if area < _LEAST_FILL * (cv2.contourArea(hull) + perimeter / 2):
+        return None
+    rough = _rough_corners(hull, perimeter)
+    if rough is None:
+        return None
+    cut = any(touched)
+    tilt_cos = _cut_tilt(touched, (wide, tall), size_m) if cut else tilt_cosine(rough, size_m)
+    if tilt_cos < _LEAST_TILT_COS - 0.1:
+        return None
+    corners = _fitted_corners(rough, contour.reshape(-1, 2))
+    if corners is None:
+        return None
+    edges = corners[_NEXT] - corners
+    if np.hypot(edges[:, 0], edges[:, 1]).min() < LEAST_SIDE:
+        return None
+    full = _area(corners)
+    fill = min(area / full, full / area)
+    if not cut:
+        tilt_cos = tilt_cosine(corners, size_m)
+    if fill < _LEAST_FILL or tilt_cos < _LEAST_TILT_COS:
+        return None
+    centre = corners.mean(axis=0)
+    return _Shape(corners, (float(centre[0]), float(centre[1])), fill, tilt_cos, math.sqrt(full), cut)
+
+
+def _with_colour(shape: _Shape, field: ColourField) -> Quad | None:
+    strength, purity, unevenness = _inside(shape.corners, field)
+    if not math.isfinite(unevenness):
+        return None
+    return Quad(shape.corners, shape.fill, shape.tilt_cos, unevenness, strength, purity, shape.cut, shape.side)
+
+
+def _cut_tilt(touched: tuple[bool, bool, bool, bool], extent: tuple[int, int], size_m: tuple[float, float]) -> float:
+    """Bound of the tilt's cosine for a region that the frame cuts: what is seen of it is a least extent."""
+    wide, tall = extent[0] / size_m[0], extent[1] / size_m[1]
+    cut_across, cut_down = touched[0] or touched[2], touched[1] or touched[3]
+    if cut_across and cut_down:
+        return 1.0
+    return float(min(1.0, tall / wide)) if cut_across else float(min(1.0, wide / tall))
+
+
+def _rough_corners(hull: NDArray[np.int32], perimeter: float) -> FloatArray | None:
+    """Corners (4, 2), clockwise, of a hull that simplifies to four."""
+    for fraction in (0.02, 0.03, 0.045, 0.065, 0.09, 0.115):
+        polygon = cv2.approxPolyDP(hull, fraction * perimeter, True)
+        if len(polygon) == 4:
+            return clockwise_from_top_left(polygon.reshape(4, 2).astype(np.float64))
+        if len(polygon) < 4:
+            return None
+    return None
+
+
+def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32]) -> FloatArray | None:
+    """Corners (4, 2), clockwise: crossings of lines through the contour's points between the rough corners."""
+    along = rough[_NEXT] - rough
+    length = np.hypot(along[:, 0], along[:, 1])
+    if length.min() < LEAST_SIDE - 2:
+        return None
+    along /= length[:, None]
+    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    points = contour[:: max(1, len(contour) // 400)].astype(np.float64)
+    place = points @ along.T - np.sum(rough * along, axis=1)  # (N, 4): along each side
+    off = points @ outward.T - np.sum(rough * outward, axis=1)
+    near = ((np.abs(off) < np.maximum(2.0, 0.06 * length)) & (np.abs(place - length / 2) < 0.4 * length)).astype(float)
+    count = near.sum(axis=0)
+    if count.min() < 3:
+        return None
+    mean_place, mean_off = (near * place).sum(axis=0) / count, (near * off).sum(axis=0) / count
+    from_place, from_off = near * (place - mean_place), near * (off - mean_off)
+    slope = (from_place * from_off).sum(axis=0) / np.maximum((from_place**2).sum(axis=0), 1e-9)
+    rms = np.sqrt(((from_off - slope * from_place) ** 2).sum(axis=0) / count)
+    if np.any(rms > np.maximum(0.7, 0.025 * length)):
+        return None
+    # A contour runs through the centres of the outermost pixels, half a pixel inside the region.
+    start = rough + along * mean_place[:, None] + outward * (mean_off + 0.5)[:, None]
+    direction = along + outward * slope[:, None]
+    before, before_direction = start[_BEFORE], direction[_BEFORE]
+    cross = before_direction[:, 0] * direction[:, 1] - before_direction[:, 1] * direction[:, 0]
+    if np.any(np.abs(cross) < 0.2):
+        return None
+    apart = start - before
+    step = (apart[:, 0] * direction[:, 1] - apart[:, 1] * direction[:, 0]) / cross
+    return np.asarray(before + before_direction * step[:, None], dtype=np.float64)
+
+
+def _inside(corners: FloatArray, field: ColourField) -> tuple[float, float, float]:
+    """Median strength and purity inside, and the unevenness: cell means against a plane, over the mean."""
+    height, width = field.strength.shape
+    low = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
+    high = np.minimum(np.ceil(corners.max(axis=0)), [width - 1, height - 1]).astype(int)
+    step = max(1, int(math.sqrt(float(np.prod(high - low + 1)) / _MOST_SAMPLES)))
+    u, v = np.meshgrid(np.arange(low[0], high[0] + 1, step), np.arange(low[1], high[1] + 1, step))
+    inverse = np.linalg.inv(homography(corners, (1.0, 1.0)))
+    place = inverse @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    x, y = place[0] / place[2], place[1] / place[2]
+    # The rim is mixed with the surroundings: two pixels and a tenth of the side are left out.
+    reach = 0.4 - min(0.2, 2.0 / max(1.0, math.sqrt(_area(corners))))
+    inner = (np.abs(x) < reach) & (np.abs(y) < reach)
+    count = int(np.count_nonzero(inner))
+    if count < 4:
+        return 0.0, 0.0, math.nan
+    values: Channel = field.strength[v.ravel()[inner], u.ravel()[inner]]
+    purity: Channel = field.purity[v.ravel()[inner], u.ravel()[inner]]
+    strength = float(np.median(values))
+    grid = int(np.clip(math.sqrt(count / 12), 2, _GRID))
+    cell_x = np.clip(((x[inner] / reach + 1) / 2 * grid).astype(int), 0, grid - 1)
+    cell_y = np.clip(((y[inner] / reach + 1) / 2 * grid).astype(int), 0, grid - 1)
+    cell = cell_y * grid + cell_x
+    number = np.bincount(cell, minlength=grid * grid)
+    full = number > 0
+    mean = np.bincount(cell, weights=values, minlength=grid * grid)[full] / number[full]
+    if np.count_nonzero(full) < 4 or strength <= 0:
+        return strength, float(np.median(purity)), 0.0
+    where = np.flatnonzero(full)
+    plane = np.column_stack([np.ones(len(where)), where % grid, where // grid]).astype(np.float64)
+    rest = mean - plane @ np.linalg.lstsq(plane, mean, rcond=None)[0]
+    return strength, float(np.median(purity)), float(np.sqrt(np.mean(rest**2))) / strength

@@ -1,0 +1,227 @@
+"""Which grid in a picture is the asked board: levels of reduction, channels, size, reading direction, frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from calibration.detect.grid import Grid, find_grids, predict_missing, steps_of
+from calibration.detect.prediction import Prediction
+from calibration.detect.quality import median_sides
+from calibration.detect.saddle import Gray, find_saddles, reduce_picture
+from calibration.detect.signal import surrounded
+from calibration.types import FloatArray, Picture
+
+_FIRST_WIDTH_PX = 1000
+"""The picture is searched first at the power of two that brings it below twice this width."""
+_SMALLEST_STEP_PX = 5.5
+"""Grids with smaller squares, in pixels of the level they were found on, wait for a finer level."""
+_LEAST_PRESENT = 0.8
+_LEAST_REPORTED = 0.15
+_MARGIN_SIGMAS = 4.0
+_MATCH_SIGMAS = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Board:
+    """The asked grid as the coarse search saw it, in pixels of the picture.
+
+    ``points_px`` (rows, columns, 2), every place filled (from its neighbours where not seen); ``polarity`` as in
+    :class:`Grid`; ``whole``: the outer squares lie inside the picture; ``error_px`` how far a point may be off.
+    """
+
+    points_px: FloatArray
+    polarity: int
+    whole: bool
+    error_px: float
+
+
+def find_board(
+    picture: Picture, size: tuple[int, int], colours: tuple[str, ...], near: Prediction | None
+) -> Board | str:
+    """The board with ``size`` = (columns, rows) inner corners, or one line that says why there is none."""
+    corner = np.zeros(2, dtype=np.int64)
+    part = picture
+    if near is not None:
+        window = _window(picture, size, near)
+        if window is None:
+            return "the target is expected outside the picture"
+        corner = np.array(window[:2])
+        part = picture[window[1] : window[3], window[0] : window[2]]
+    others: list[Grid] = []
+    least = max(4, round(_LEAST_REPORTED * size[0] * size[1]))
+    for factor, gray in _levels(part, colours, near, size):
+        grids = [
+            grid for grid in find_grids(find_saddles(gray), least) if factor == 1 or _step(grid) > _SMALLEST_STEP_PX
+        ]
+        boards: list[Board] = []
+        for grid in grids:
+            points = (grid.points + 0.5) * factor - 0.5 + corner
+            full = Grid(points, grid.polarity, grid.amplitude)
+            oriented = upright(full, size, near)
+            if oriented is None or oriented.present < _LEAST_PRESENT * size[0] * size[1]:
+                others.append(full)
+                continue
+            board = _board(oriented, picture, error_px=0.3 * factor)
+            if near is None or _fits(board, near):
+                boards.append(board)
+        result = _choose(boards, size, near)
+        if result is not None:
+            return result
+    return _reason(others, size, picture, near)
+
+
+def upright(grid: Grid, size: tuple[int, int], near: Prediction | None = None) -> Grid | None:
+    """``grid`` turned by quarters so that it has ``size`` and its rows run down the picture; None for another size.
+
+    Of the readings that have the size, the one whose columns run most to the right and rows most downwards; with a
+    prediction the one nearest to it.
+    """
+    best: Grid | None = None
+    best_value = -np.inf
+    points, polarity = grid.points, grid.polarity
+    for _ in range(4):
+        if (points.shape[1], points.shape[0]) == size:
+            if near is None:
+                steps = np.nanmean(steps_of(points).reshape(-1, 2, 2), axis=0)
+                lengths = np.linalg.norm(steps, axis=1)
+                value = float(steps[0, 0] / lengths[0] + steps[1, 1] / lengths[1])
+            else:
+                value = -float(np.nansum((points.reshape(-1, 2) - near.points_px) ** 2))
+            if value > best_value:
+                best, best_value = Grid(points, polarity, grid.amplitude), value
+        # A quarter turn: columns run where rows ran. The first point is the old last row's first one, and the square
+        # between its new directions is the one across an edge from the old first quadrant there.
+        polarity = polarity * (-1) ** (points.shape[0] - 1) * -1
+        points = np.swapaxes(points, 0, 1)[:, ::-1]
+    return best
+
+
+def _levels(
+    picture: Picture, colours: tuple[str, ...], near: Prediction | None, size: tuple[int, int]
+) -> Iterator[tuple[int, Gray]]:
+    """(factor, reduced channel) in the order of trial."""
+    finest = 1
+    while picture.shape[1] / finest > 2 * _FIRST_WIDTH_PX:
+        finest *= 2
+    first = 2 * finest
+    order = [2 * first, first, 4 * first, finest]
+    if near is not None:
+        side = float(median_sides(steps_of(near.points_px.reshape(size[1], size[0], 2))).min())
+        order = [factor for factor in (4, 2, 8, 1) if side / factor > _SMALLEST_STEP_PX * 1.2] or [1]
+    kinds = _channels(colours)
+    reduced: dict[int, Picture] = {}
+    for number, kind in enumerate(kinds):
+        for factor in order if number == 0 else order[:2]:
+            if min(picture.shape[:2]) // factor < 16:
+                continue
+            if factor not in reduced:
+                reduced[factor] = reduce_picture(picture, factor)
+            yield factor, _channel(reduced[factor], kind)
+
+
+def _channels(colours: tuple[str, ...]) -> list[str]:
+    """Which channels to search, the likeliest first: the one in which the named colours differ most."""
+    named = {colour.lower() for colour in colours}
+    if named == {"red", "white"}:
+        return ["blue-green", "luma", "red"]
+    if named == {"red", "black"}:
+        return ["red", "luma", "blue-green"]
+    return ["luma", "red", "blue-green"]
+
+
+def _channel(picture: Picture, kind: str) -> Gray:
+    if kind == "red":
+        plane = cv2.extractChannel(picture, 2)
+    elif kind == "blue-green":
+        plane = cv2.addWeighted(cv2.extractChannel(picture, 0), 0.5, cv2.extractChannel(picture, 1), 0.5, 0)
+    else:
+        plane = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    return np.asarray(plane, dtype=np.float32)
+
+
+def _window(picture: Picture, size: tuple[int, int], near: Prediction) -> tuple[int, int, int, int] | None:
+    """(left, top, right, bottom) of where the expected board may stand, one square and a half around it."""
+    height, width = picture.shape[:2]
+    sides = median_sides(steps_of(near.points_px.reshape(size[1], size[0], 2)))
+    margin = _MARGIN_SIGMAS * near.sigma_px + 1.6 * float(sides.max()) + 8
+    low = np.floor(near.points_px.min(axis=0) - margin).astype(np.int64)
+    high = np.ceil(near.points_px.max(axis=0) + margin).astype(np.int64)
+    left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+    right, bottom = min(int(high[0]) + 1, width), min(int(high[1]) + 1, height)
+    return (left, top, right, bottom) if right - left >= 16 and bottom - top >= 16 else None
+
+
+def _step(grid: Grid) -> float:
+    return float(median_sides(steps_of(grid.points)).min())
+
+
+def _fits(board: Board, near: Prediction) -> bool:
+    away = board.points_px.reshape(-1, 2) - near.points_px
+    return float(np.sqrt((away**2).mean())) < _MATCH_SIGMAS * near.sigma_px + 2 * board.error_px
+
+
+def _inside(points: FloatArray, picture: Picture) -> FloatArray:
+    edge = np.array([picture.shape[1], picture.shape[0]]) - 1.0
+    return np.asarray(((points >= 0) & (points <= edge)).all(axis=-1), dtype=np.float64)
+
+
+def _open_sides(points_px: FloatArray, picture: Picture) -> tuple[int, int]:
+    """How many of (left and right, top and bottom) sides are so near the frame that a further line is out of it."""
+    inside = _inside(surrounded(points_px), picture)
+    left_right = [inside[1:-1, 0].mean(), inside[1:-1, -1].mean()]
+    top_bottom = [inside[0, 1:-1].mean(), inside[-1, 1:-1].mean()]
+    return sum(share < 0.5 for share in left_right), sum(share < 0.5 for share in top_bottom)
+
+
+def _board(grid: Grid, picture: Picture, error_px: float) -> Board:
+    points = grid.points
+    while not np.isfinite(points).all():
+        expected = predict_missing(points)
+        filled = np.where(np.isfinite(points), points, expected)
+        if np.isfinite(filled).sum() == np.isfinite(points).sum():
+            break
+        points = filled
+    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px)
+
+
+def _choose(boards: list[Board], size: tuple[int, int], near: Prediction | None) -> Board | str | None:
+    """The one board, a reason where there are several, None where there is none."""
+    boards = [board for board in boards if np.isfinite(board.points_px).all()]
+    whole = [board for board in boards if board.whole]
+    boards = whole or boards
+    if near is not None and len(boards) > 1:
+        away = [float(((board.points_px.reshape(-1, 2) - near.points_px) ** 2).mean()) for board in boards]
+        return boards[int(np.argmin(away))]
+    if len(boards) > 1:
+        return f"ambiguous: {len(boards)} boards with {size[0]}x{size[1]} inner corners are in view; cover all but one"
+    return boards[0] if boards else None
+
+
+def cut_too_far(board: Board, picture: Picture) -> bool:
+    """Whether the frame hides so much that a larger board, cut on two neighbouring sides, would look the same."""
+    columns, rows = _open_sides(board.points_px, picture)
+    return columns > 0 and rows > 0
+
+
+def _reason(others: list[Grid], size: tuple[int, int], picture: Picture, near: Prediction | None) -> str:
+    wanted = f"{size[0]}x{size[1]}"
+    place = " near where the board is expected" if near is not None else ""
+    seen = [grid for grid in others if grid.present >= max(6, _LEAST_REPORTED * size[0] * size[1])]
+    if not seen:
+        return f"no chessboard pattern found{place} (not in view, too dark, too blurred, or its squares too small)"
+    grid = max(seen, key=lambda grid: grid.present * grid.amplitude)
+    turned = upright(grid, grid.size) or grid
+    steps = np.nanmean(steps_of(turned.points).reshape(-1, 2, 2), axis=0)
+    columns, rows = turned.size
+    if abs(steps[0, 0]) < abs(steps[0, 1]):
+        columns, rows = rows, columns
+    if (columns, rows) == size or (rows, columns) == size:
+        return f"only {grid.present} of {wanted} inner corners can be seen{place}: the board is partly hidden"
+    cut = ""
+    if sum(_open_sides(grid.points, picture)) > 0 and columns * rows < size[0] * size[1]:
+        cut = ": the board is cut by the frame"
+    return f"found {columns}x{rows} of {wanted} inner corners{place}{cut}"

@@ -1,0 +1,1 @@
+"""Solving a level: from detections to a lens with its uncertainty, with or without an engine in the loop."""

@@ -1,0 +1,350 @@
+"""The joint method: a few real pictures where they tell most, one least-squares fit, a check on the engine's render.
+
+Pictures are planned one by one: the target in the middle tells the focal length, then it goes to the corners, until
+the overlay error expected from the covariance is below the goal. The engine is asked for a render only at the end,
+at the values as they will be published.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+
+from calibration.camera import project_points, target_points_world
+from calibration.compare import predicted_overlay
+from calibration.errors import CalibrationError, NotEnoughData
+from calibration.lens import Lens
+from calibration.solve.level import LevelFit, held_out_residuals, solve_level
+from calibration.solve.outcome import level_result, pixel_error
+from calibration.solve.problem import View
+from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at, expected_points
+from calibration.tables import LeftOut, LevelResult, PixelError
+from calibration.types import Detection, FloatArray, Refusal, Role, Target
+
+_PLACES: tuple[tuple[float, float, Role], ...] = (
+    (1.0, 1.0, Role.K2),
+    (-1.0, -1.0, Role.K2),
+    (1.0, -1.0, Role.K2),
+    (-1.0, 1.0, Role.K2),
+    (-1.0, 0.0, Role.K1),
+    (1.0, 0.0, Role.K1),
+    (0.0, -1.0, Role.FREE),
+    (0.0, 1.0, Role.FREE),
+)
+_FIRST_PLACE = (0.6, 0.4, Role.FOV)
+# Before the distortion is known, a target sent to the very corner may be bent out of the picture.
+_FIRST_GUESS_FOV_DEG = 40.0
+# Only aims the head at a target in the middle, which hardly depends on it.
+
+
+@dataclass(frozen=True, slots=True)
+class JointOptions:
+    """``goal_px``: stop taking pictures when the largest expected overlay error is below it. ``min_views`` and
+    ``max_views`` bound the real pictures of a level, ``verify_views`` the engine's renders. ``margin``: distance kept
+    from the picture's border, as a share of its width. ``fill``: largest share of the picture's height that a target
+    chosen for a level may take."""
+
+    goal_px: float = 0.03
+    min_views: int = 6
+    max_views: int = 12
+    verify_views: int = 2
+    margin: float = 0.02
+    fill: float = 0.55
+
+
+class _Stage(Enum):
+    PROBE = auto()
+    COLLECT = auto()
+    VERIFY = auto()
+    DONE = auto()
+
+
+class JointMethod:
+    """See the module; implements :class:`calibration.solve.search.LevelMethod`."""
+
+    def __init__(self, task: LevelTask, options: JointOptions | None = None) -> None:
+        self._task = task
+        self._options = options or JointOptions()
+        self._stage = _Stage.PROBE
+        self._steps = 0
+        self._pending: dict[int, Capture] = {}
+        self._views: list[View] = []
+        self._left_out: list[LeftOut] = []
+        self._fit: LevelFit | None = None
+        self._problem = ""
+        self._probes = self._probe_order()
+        self._target = ""
+        self._places: list[tuple[float, float, Role]] = []
+        self._again: dict[int, tuple[float, float, Role]] = {}
+        self._checks: list[View] = []
+        self._engine_residuals: list[FloatArray] = []
+        self._check_failures: list[str] = []
+        self._engine_reason = "the engine's render was not checked"
+
+    @property
+    def done(self) -> bool:
+        return self._stage is _Stage.DONE and not self._pending
+
+    @property
+    def progress(self) -> float:
+        total = 1 + self._options.min_views + self._options.verify_views
+        told = len(self._views) + len(self._engine_residuals)
+        return 1.0 if self.done else min(told / total, 0.99)
+
+    @property
+    def fit(self) -> LevelFit | None:
+        """The newest fit, for reports."""
+        return self._fit
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The real pictures' detections so far, for reports."""
+        return tuple(self._views)
+
+    def ask(self) -> Capture | None:
+        if self._stage is _Stage.PROBE:
+            return None if self._pending else self._ask_probe()
+        if self._stage is _Stage.COLLECT:
+            # One capture may run ahead of the fit once the distortion is known.
+            if len(self._pending) > (1 if len(self._views) >= 3 else 0):
+                return None
+            return self._ask_place()
+        if self._stage is _Stage.VERIFY:
+            return self._ask_check()
+        return None
+
+    def tell(self, observation: Observation) -> None:
+        capture = self._pending.pop(observation.step)
+        if self._stage is _Stage.PROBE:
+            self._tell_probe(capture, observation)
+        elif capture.source is Source.VIRTUAL:
+            self._tell_check(capture, observation)
+        else:
+            self._tell_view(capture, observation)
+
+    def result(self) -> LevelResult:
+        if self._fit is None or self._problem:
+            raise NotEnoughData(self._problem or "the level was not finished")
+        return level_result(
+            self._fit,
+            self._task.zoom,
+            self._task.focus,
+            held_out=held_out_residuals(self._fit, self._views),
+            engine_overlay_px=self._engine_overlay(),
+            engine_reason=self._engine_reason,
+            left_out=self._left_out,
+        )
+
+    # --- probing: which target, and roughly which focal length ---
+
+    def _probe_order(self) -> list[str]:
+        names = list(self._task.targets)
+        guess = self._task.guess
+        if guess is None:
+            return names
+        best = self._best_target(guess)
+        return [best, *(name for name in names if name != best)]
+
+    def _ask_probe(self) -> Capture | None:
+        if not self._probes:
+            reasons = "; ".join(f"{out.picture}: {out.reason}" for out in self._left_out)
+            self._end(f"no target was found ({reasons}); is it lit, in view and where the survey says?")
+            return None
+        name = self._probes.pop(0)
+        lens = self._task.guess or Lens.from_fov(
+            self._task.image_size, _FIRST_GUESS_FOV_DEG, pixel_aspect=self._task.pixel_aspect
+        )
+        pan, tilt = aim_at(lens, self._task, self._task.targets[name], lens.principal_point_px)
+        return self._capture(Source.REAL, name, pan, tilt, Role.CENTER_SHIFT)
+
+    def _tell_probe(self, capture: Capture, observation: Observation) -> None:
+        if isinstance(observation.result, Refusal):
+            self._left_out.append(LeftOut(_name(capture, observation), observation.result.reason))
+            return
+        self._add_view(capture, observation, observation.result)
+        try:
+            self._solve()
+        except CalibrationError as error:
+            self._left_out.append(LeftOut(_name(capture, observation), str(error)))
+            self._views.clear()
+            return
+        lens = self._lens()
+        self._target = self._best_target(lens)
+        self._places = [*_PLACES] if self._task.guess is not None else [_FIRST_PLACE, *_PLACES]
+        if self._target != capture.target:
+            self._places.insert(0, (0.0, 0.0, Role.CENTER_SHIFT))
+        self._stage = _Stage.COLLECT
+
+    def _best_target(self, lens: Lens) -> str:
+        """The target that fills most of the picture without taking more than ``fill`` of its height."""
+        sizes = {name: self._share(lens, target) for name, target in self._task.targets.items()}
+        fitting = {name: share for name, share in sizes.items() if share <= self._options.fill}
+        return max(fitting, key=fitting.__getitem__) if fitting else min(sizes, key=sizes.__getitem__)
+
+    def _share(self, lens: Lens, target: Target) -> float:
+        if target.pose is None:
+            return 0.0
+        distance_m = float(np.linalg.norm(np.asarray(target.pose.centre_m) - np.asarray(self._task.pivot_m)))
+        width_m, height_m = target.outline_m()
+        aspect = lens.image_size[0] / lens.image_size[1]
+        return max(height_m, width_m / aspect) * lens.f_px / max(distance_m, 1e-3) / lens.image_size[1]
+
+    # --- collecting: the target where it tells most ---
+
+    def _ask_place(self) -> Capture | None:
+        if not self._places or self._enough():
+            if not self._pending:
+                self._begin_checks()
+                return self.ask()
+            return None
+        place = self._places.pop(0)
+        pan, tilt = self._angles_for(place)
+        capture = self._capture(Source.REAL, self._target, pan, tilt, place[2])
+        self._again[capture.step] = place
+        return capture
+
+    def _enough(self) -> bool:
+        """Pending pictures count as taken, so that one running ahead is not one too many."""
+        count = len(self._views) + len(self._pending)
+        if count >= self._options.max_views:
+            return True
+        if count < self._options.min_views or self._fit is None:
+            return False
+        return predicted_overlay(self._fit.lens, self._fit.covariance).max_px <= self._options.goal_px
+
+    def _angles_for(self, place: tuple[float, float, Role]) -> tuple[float, float]:
+        """Head angles that put the target as far towards ``place`` as its outline stays inside the picture."""
+        lens, target = self._lens(), self._task.targets[self._target]
+        width, height = lens.image_size
+        margin = self._options.margin * width
+        reach = np.array([(width - 1) / 2 - margin, (height - 1) / 2 - margin])
+        centre = np.array([(width - 1) / 2, (height - 1) / 2])
+        direction = np.array(place[:2])
+        pixel = centre + direction * reach * 0.5
+        pan, tilt = aim_at(lens, self._task, target, (float(pixel[0]), float(pixel[1])))
+        for _ in range(6):
+            outline = self._outline(lens, target, pan, tilt)
+            if not np.isfinite(outline).all():
+                pixel = (pixel + centre) / 2
+            else:
+                over = np.maximum(outline.max(axis=0) - centre, centre - outline.min(axis=0))
+                pixel = pixel + np.where(direction != 0, np.sign(direction), 0.0) * (reach * np.abs(direction) - over)
+            pan, tilt = aim_at(lens, self._task, target, (float(pixel[0]), float(pixel[1])))
+        return pan, tilt
+
+    def _outline(self, lens: Lens, target: Target, pan: float, tilt: float) -> FloatArray:
+        width_m, height_m = target.outline_m()
+        edge = np.array([[x, y] for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]) * [width_m, height_m]
+        if target.pose is None:
+            return np.full((len(edge), 2), np.nan)
+        return project_points(lens, self._task.pose(pan, tilt), target_points_world(target.pose, edge))
+
+    def _tell_view(self, capture: Capture, observation: Observation) -> None:
+        if isinstance(observation.result, Refusal):
+            name = _name(capture, observation)
+            self._left_out.append(LeftOut(name, observation.result.reason))
+            place = self._again.pop(capture.step, None)
+            if place is not None:
+                x, y, role = place
+                if max(abs(x), abs(y)) > 0.7:  # once more, further in; then this place is given up
+                    self._places.insert(0, (x * 0.7, y * 0.7, role))
+            return
+        self._add_view(capture, observation, observation.result)
+        try:
+            self._solve()
+        except CalibrationError as error:
+            if self._fit is None:
+                self._end(str(error))
+                return
+            self._views.pop()
+            self._left_out.append(LeftOut(_name(capture, observation), str(error)))
+
+    # --- verifying: the engine's own render at the values as published ---
+
+    def _begin_checks(self) -> None:
+        if self._fit is None or len(self._views) < 2:
+            self._end("too few pictures show the target: " + "; ".join(out.reason for out in self._left_out[-3:]))
+            return
+        usable = [v for v in self._views if v.name not in {name for name, _ in self._fit.dropped}]
+        # The last picture's pose first: the head stands there already.
+        self._checks = [usable[-1], *usable[1:-1]][: self._options.verify_views]
+        self._stage = _Stage.VERIFY
+        if not self._checks:
+            self._stage = _Stage.DONE
+
+    def _ask_check(self) -> Capture | None:
+        index = len(self._engine_residuals) + len(self._pending) + len(self._check_failures)
+        if index >= len(self._checks):
+            if not self._pending:
+                self._stage = _Stage.DONE
+            return None
+        if self._pending:
+            return None
+        view, lens = self._checks[index], self._lens()
+        if view.camera_pose is None:
+            return None
+        pan, tilt = view.camera_pose.pan_deg, view.camera_pose.tilt_deg
+        return self._capture(Source.VIRTUAL, view.target_name, pan, tilt, Role.FREE, lens=lens)
+
+    def _tell_check(self, capture: Capture, observation: Observation) -> None:
+        view = self._checks[len(self._engine_residuals) + len(self._check_failures)]
+        if isinstance(observation.result, Refusal):
+            self._check_failures.append(observation.result.reason)
+            self._engine_reason = f"the target was not found in the engine's render: {observation.result.reason}"
+        else:
+            self._engine_residuals.append(_matched(view.detection, observation.result))
+        if len(self._engine_residuals) + len(self._check_failures) >= len(self._checks):
+            self._stage = _Stage.DONE
+
+    def _engine_overlay(self) -> PixelError | None:
+        return pixel_error(self._engine_residuals)
+
+    # --- shared ---
+
+    def _capture(
+        self, source: Source, target: str, pan: float, tilt: float, role: Role, lens: Lens | None = None
+    ) -> Capture:
+        expected, sigma = None, 0.0
+        if self._fit is not None and len(self._views) >= 3:
+            expected = expected_points(self._lens(), self._task, self._task.targets[target], pan, tilt)
+            sigma = 3.0
+            if not np.isfinite(expected).all():
+                expected = None
+        capture = Capture(self._steps, source, target, pan, tilt, role, lens, expected, sigma)
+        self._steps += 1
+        self._pending[capture.step] = capture
+        return capture
+
+    def _add_view(self, capture: Capture, observation: Observation, detection: Detection) -> None:
+        target = self._task.targets[capture.target]
+        name = _name(capture, observation)
+        self._views.append(View(name, capture.target, target, detection, observation.camera_pose))
+
+    def _solve(self) -> None:
+        self._fit = solve_level(
+            self._views,
+            self._task.image_size,
+            pixel_aspect=self._task.pixel_aspect,
+            nodal_offset_mm=self._task.nodal_offset_mm,
+        )
+
+    def _lens(self) -> Lens:
+        if self._fit is None:
+            raise NotEnoughData("no picture of this level shows its target yet")
+        return self._fit.lens
+
+    def _end(self, problem: str) -> None:
+        self._problem = problem
+        self._stage = _Stage.DONE
+
+
+def _name(capture: Capture, observation: Observation) -> str:
+    return observation.picture or f"step {capture.step}"
+
+
+def _matched(real: Detection, virtual: Detection) -> FloatArray:
+    """Virtual minus real corners (N, 2) px for the points found in both."""
+    _, first, second = np.intersect1d(real.point_ids, virtual.point_ids, return_indices=True)
+    return np.asarray(virtual.points_px[second] - real.points_px[first])

@@ -1,0 +1,105 @@
+"""From a fit to the level's entry in the lens table: numbers, sigmas, evidence, and reasons for what is not told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calibration.compare import NEGLIGIBLE_PX, edge_effect_px, predicted_overlay
+from calibration.solve.level import LevelFit
+from calibration.tables import LeftOut, LevelResult, LevelStatus, PixelError, Sigma
+from calibration.types import FloatArray
+
+USABLE_OVERLAY_PX = 1.0
+"""Expected overlay error above which a level is called degraded: a shift that a viewer begins to see."""
+
+NODAL_NOT_MEASURED = (
+    "not measured: the pictures do not show targets at two distances; the pivot is taken as the entrance pupil"
+)
+
+
+def pixel_error(residuals: Sequence[FloatArray]) -> PixelError | None:
+    """RMS per coordinate and largest distance of residuals (N, 2) px; None when there are none."""
+    given = [r for r in residuals if len(r)]
+    if not given:
+        return None
+    stacked = np.concatenate(given)
+    return PixelError(float(np.sqrt(np.mean(stacked**2))), float(np.max(np.linalg.norm(stacked, axis=1))))
+
+
+def level_result(
+    fit: LevelFit,
+    zoom: float,
+    focus: float,
+    *,
+    held_out: Mapping[str, FloatArray],
+    engine_overlay_px: PixelError | None = None,
+    engine_reason: str = "no engine took part",
+    left_out: Sequence[LeftOut] = (),
+    nodal_known: bool = False,
+) -> LevelResult:
+    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it;
+    ``nodal_known``: the nodal offset was given from outside and stands in the lens, else it is not told."""
+    expected = predicted_overlay(fit.lens, fit.covariance)
+    held = pixel_error(list(held_out.values()))
+    reasons = {name: "the pictures do not show it; taken as 0" for name in fit.untold}
+    if not nodal_known:
+        reasons["nodal_offset_mm"] = NODAL_NOT_MEASURED
+    if held is None:
+        reasons["held_out_px"] = "no picture could be spared from the fit"
+    if engine_overlay_px is None:
+        reasons["engine_overlay_px"] = engine_reason
+    trouble = _trouble(fit, expected.max_px, engine_overlay_px)
+    sigma = fit.sigma
+    all_left_out = [*left_out, *(LeftOut(name, why) for name, why in fit.dropped), *_outliers(fit)]
+    return LevelResult.from_lens(
+        zoom,
+        focus,
+        fit.lens,
+        status=LevelStatus.DEGRADED if trouble else LevelStatus.OK,
+        reason="; ".join(trouble) or None,
+        reasons=reasons,
+        sigma=Sigma(
+            fov_x_deg=fit.sigma_fov_x_deg,
+            k1=None if "k1" in fit.untold else float(sigma[1]),
+            k2=None if "k2" in fit.untold else float(sigma[2]),
+            center_shift_px=None if "center_shift_px" in fit.untold else (float(sigma[3]), float(sigma[4])),
+        ),
+        residual_px=PixelError(fit.rms_px, fit.max_px),
+        held_out_px=held,
+        predicted_overlay_px=PixelError(expected.rms_px, expected.max_px),
+        engine_overlay_px=engine_overlay_px,
+        scenario=1 if edge_effect_px(fit.lens)[1] <= NEGLIGIBLE_PX else 2,
+        left_out=tuple(all_left_out),
+    )
+
+
+def _outliers(fit: LevelFit) -> list[LeftOut]:
+    by_picture: dict[str, list[float]] = {}
+    for name, _, distance in fit.outliers:
+        by_picture.setdefault(name, []).append(distance)
+    return [
+        LeftOut(name, f"{len(far)} of its points left out: up to {max(far):.2f} px from where all others put them")
+        for name, far in by_picture.items()
+    ]
+
+
+def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -> list[str]:
+    trouble: list[str] = []
+    if not math.isfinite(expected_max_px) or expected_max_px > USABLE_OVERLAY_PX:
+        trouble.append(
+            f"expected overlay error up to {expected_max_px:.1f} px: take more pictures, the target nearer the corners"
+        )
+    if fit.untold:
+        trouble.append(f"not told by the pictures: {', '.join(fit.untold)}")
+    share = len(fit.outliers) / max(fit.points + len(fit.outliers), 1)
+    if share > 0.03:
+        trouble.append(f"{share:.0%} of the points disagree with the rest")
+    if engine is not None and engine.max > max(USABLE_OVERLAY_PX, 5 * expected_max_px):
+        trouble.append(
+            f"the engine's render is up to {engine.max:.1f} px off at these values: its lens model is not the "
+            "profile's (check the radius unit of k1 and k2, the centre shift's sign and origin, the FoV's axis)"
+        )
+    return trouble

@@ -1,0 +1,134 @@
+"""Where the iteration of a level starts: a focal length, and a pose for each picture that has none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from calibration.camera import rays_of, target_points_world, world_to_camera
+from calibration.errors import NotEnoughData
+from calibration.lens import Lens
+from calibration.solve.problem import View
+from calibration.types import FloatArray
+
+_FOVS_DEG = (120.0, 95.0, 75.0, 60.0, 48.0, 38.0, 30.0, 22.0, 15.0, 9.0, 5.0, 3.0)
+_K1_HW = (-0.15, -0.05, 0.0, 0.05)
+# Coarse steps over all lenses that make pictures: the iteration converges from the nearest by far.
+
+FreePoses = dict[int, tuple[FloatArray, FloatArray]]
+
+
+def start(
+    views: Sequence[View],
+    image_size: tuple[int, int],
+    pixel_aspect: float,
+    nodal_offset_mm: float,
+    guess: Lens | None = None,
+) -> tuple[Lens, FreePoses]:
+    """A lens and the free poses to start from.
+
+    With known poses every ray is known and u = f x + cx is linear in (f, cx, cy); otherwise the focal length and
+    the sign of the distortion are tried in coarse steps, each with the poses that fit it best.
+    """
+    free = {i: v for i, v in enumerate(views) if v.free}
+    if guess is not None:
+        return guess, _poses(free, guess)[0]
+    if len(free) < len(views):
+        lens = _from_known_rays([v for v in views if not v.free], image_size, pixel_aspect, nodal_offset_mm)
+        return lens, _poses(free, lens)[0]
+    best: tuple[float, Lens, FreePoses] | None = None
+    for fov in _FOVS_DEG:
+        for k1_hw in _K1_HW:
+            straight = Lens.from_fov(image_size, fov, pixel_aspect=pixel_aspect, nodal_offset_mm=nodal_offset_mm)
+            lens = straight.with_hw(straight.f_px, k1_hw, 0.0)
+            poses, error = _poses(free, lens)
+            if best is None or error < best[0]:
+                best = error, lens, poses
+    if best is None or not math.isfinite(best[0]):
+        raise NotEnoughData("no pose explains any picture; check the target's size and its squares")
+    return best[1], best[2]
+
+
+def _from_known_rays(
+    views: Sequence[View], image_size: tuple[int, int], pixel_aspect: float, nodal_offset_mm: float
+) -> Lens:
+    width, height = image_size
+    rows: list[FloatArray] = []
+    values: list[FloatArray] = []
+    for view in views:
+        if view.camera_pose is None or view.target.pose is None:
+            continue
+        world = target_points_world(view.target.pose, view.target.points_m()[view.detection.point_ids])
+        rays = rays_of(world_to_camera(view.camera_pose, nodal_offset_mm, world))
+        ones, zeros = np.ones(len(rays)), np.zeros(len(rays))
+        rows.append(np.column_stack([rays[:, 0], ones, zeros]))
+        values.append(view.detection.points_px[:, 0] - (width - 1) / 2)
+        rows.append(np.column_stack([pixel_aspect * rays[:, 1], zeros, ones]))
+        values.append(view.detection.points_px[:, 1] - (height - 1) / 2)
+    matrix, right = np.concatenate(rows), np.concatenate(values)
+    usable = np.isfinite(matrix).all(axis=1)
+    if usable.sum() < 6:
+        raise NotEnoughData(
+            "the target is behind the camera in every picture; check its pose and the head's angles (pan is positive "
+            "to the right, tilt upwards)"
+        )
+    # The centre is only loosely free at the start: with few points it trades against the focal length.
+    hold = np.diag([0.0, 1e-2, 1e-2])
+    matrix, right = matrix[usable], right[usable]
+    f_px, shift_x, shift_y = np.linalg.solve(matrix.T @ matrix + hold, matrix.T @ right)
+    if not f_px > 0:
+        raise NotEnoughData(
+            "the pictures contradict the poses (the target moves the wrong way); check the signs of pan and tilt"
+        )
+    return Lens(
+        image_size,
+        float(f_px),
+        center_shift_px=(float(shift_x), float(shift_y)),
+        pixel_aspect=pixel_aspect,
+        nodal_offset_mm=nodal_offset_mm,
+    )
+
+
+def _poses(free: dict[int, View], lens: Lens) -> tuple[FreePoses, float]:
+    """Camera-from-target poses for ``lens`` and the RMS distance in px that they leave (infinite if none fits)."""
+    poses: FreePoses = {}
+    squares, count = 0.0, 0
+    for index, view in free.items():
+        plane = view.target.points_m()[view.detection.point_ids]
+        points = np.column_stack([plane, np.zeros(len(plane))])
+        rays = lens.unproject(view.detection.points_px)
+        if len(points) < 4 or not np.isfinite(rays).all():
+            return _fallback(free, lens), math.inf
+        try:
+            found, R_vectors, t_vectors, errors = cv2.solvePnPGeneric(
+                points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error:
+            return _fallback(free, lens), math.inf
+        if not found:
+            return _fallback(free, lens), math.inf
+        best = int(np.argmin(np.asarray(errors).ravel()))
+        R_ct = np.asarray(cv2.Rodrigues(R_vectors[best])[0], dtype=np.float64)
+        t_ct_m = np.asarray(t_vectors[best], dtype=np.float64).ravel()
+        poses[index] = R_ct, t_ct_m
+        back = lens.project(rays_of(points @ R_ct.T + t_ct_m))
+        distance = back - view.detection.points_px
+        if not np.isfinite(distance).all():
+            return _fallback(free, lens), math.inf
+        squares += float(np.sum(distance**2))
+        count += len(points)
+    return poses, math.sqrt(squares / count) if count else 0.0
+
+
+def _fallback(free: dict[int, View], lens: Lens) -> FreePoses:
+    """Poses straight in front, at the distance that the target's size tells."""
+    poses: FreePoses = {}
+    for index, view in free.items():
+        spread_px = float(np.ptp(view.detection.points_px, axis=0).max())
+        distance_m = lens.f_px * max(view.target.outline_m()) / max(spread_px, 1.0)
+        centre = (view.detection.points_px.mean(axis=0) - np.asarray(lens.principal_point_px)) / lens.f_px
+        poses[index] = np.eye(3), np.array([centre[0], centre[1], 1.0]) * distance_m
+    return poses

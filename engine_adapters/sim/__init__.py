@@ -1,0 +1,5 @@
+"""The simulated studio: a camera with a zoom lens in a room, an engine on its real wire protocols, a head.
+
+It is the twin of a real studio, so it must not share the mathematics of the code that calibrates it: projection,
+distortion and drawing are its own (:mod:`.optics`, :mod:`.render`) and only the written conventions are common.
+"""

@@ -1,0 +1,78 @@
+"""The edges and areas of a panel in its own plane, metres (right, down) from its centre."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine_adapters.sim.room import Panel
+
+FloatArray = NDArray[np.float64]
+
+BEHIND, MARGIN, FIRST, SECOND = range(4)
+"""What an area shows: what lies behind the panel, its margin, its first or its second colour."""
+
+_SIDE_PIECES = 40
+_CELL_PIECES = 6
+
+
+class PanelGrid:
+    """Edges along both axes, outermost included, and the colours between them.
+
+    ``edges[axis]``: ascending positions of the edges that cross that axis (0 right, 1 down). ``areas`` (rows, columns):
+    what each cell between edges shows, with one more row and column outside on every side.
+    """
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self.edges = tuple(_edges(panel, axis) for axis in (0, 1))
+        columns, rows = panel.squares
+        checker = (np.add.outer(np.arange(rows), np.arange(columns)) % 2) + FIRST
+        if panel.colours[0] == panel.colours[1]:
+            checker[...] = FIRST
+        if panel.margin_m > 0.0:
+            checker = np.pad(checker, 1, constant_values=MARGIN)
+        self.areas = np.pad(checker, 1, constant_values=BEHIND)
+
+    def corners(self) -> FloatArray:
+        """The four outermost corners, (4, 2)."""
+        a, b = self.edges
+        return np.array([(a[0], b[0]), (a[-1], b[0]), (a[-1], b[-1]), (a[0], b[-1])])
+
+    def crossings(self) -> FloatArray:
+        """Every crossing of two edges, (N, 2)."""
+        right, down = np.meshgrid(*self.edges)
+        return np.column_stack([right.ravel(), down.ravel()])
+
+    def outline(self) -> FloatArray:
+        """The outermost outline, finely divided, (N, 2)."""
+        a, b = self.edges
+        return _rectangle(a[0], a[-1], b[0], b[-1], _SIDE_PIECES)
+
+    def checker_outline(self) -> FloatArray:
+        """The outline without the margin, finely divided, (N, 2)."""
+        half_a, half_b = self._panel.half_m
+        return _rectangle(-half_a, half_a, -half_b, half_b, _SIDE_PIECES)
+
+    def first_colour_cells(self) -> FloatArray:
+        """Outlines of the squares of the first colour, (cells, points, 2)."""
+        (columns, rows), (width, height) = self._panel.squares, self._panel.cell_m
+        cell = _rectangle(0.0, width, 0.0, height, _CELL_PIECES)
+        corners = [
+            (column * width, row * height) for row in range(rows) for column in range(columns) if not (column + row) % 2
+        ]
+        return cell[np.newaxis] + np.array(corners)[:, np.newaxis] - np.array(self._panel.half_m)
+
+
+def _edges(panel: Panel, axis: int) -> FloatArray:
+    inner = (np.arange(panel.squares[axis] + 1) - panel.squares[axis] / 2.0) * panel.cell_m[axis]
+    if panel.margin_m == 0.0:
+        return inner
+    return np.concatenate([[inner[0] - panel.margin_m], inner, [inner[-1] + panel.margin_m]])
+
+
+def _rectangle(a0: float, a1: float, b0: float, b1: float, pieces: int) -> FloatArray:
+    corners = np.array([(a0, b0), (a1, b0), (a1, b1), (a0, b1)])
+    steps = np.arange(pieces)[:, np.newaxis] / pieces
+    sides = [start + (end - start) * steps for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    return np.concatenate(sides)

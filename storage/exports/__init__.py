@@ -1,0 +1,15 @@
+"""The formats of a lens table: one module each, pure table -> bytes, with a reader and a round trip.
+
+:data:`EXPORTS` holds them by name. ``write`` never fails on a valid table; ``read`` raises
+:class:`storage.errors.BadDocument`, naming the field and what to do.
+"""
+
+from __future__ import annotations
+
+from storage.exports.base import Export
+from storage.exports.csv_table import CSV_TABLE
+from storage.exports.json_table import JSON_TABLE
+
+EXPORTS: dict[str, Export] = {export.name: export for export in (JSON_TABLE, CSV_TABLE)}
+
+__all__ = ["EXPORTS", "Export"]

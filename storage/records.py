@@ -1,0 +1,126 @@
+"""What the repository gives back: frozen values, detached from the database."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+from calibration.tables import LensTable, LevelResult
+
+EventDraft = tuple[str, Mapping[str, Any]]
+"""An event yet to be numbered and dated: its kind and its data (JSON)."""
+
+
+class JobState(StrEnum):
+    """Where a job stands. Which change is allowed is decided by the app's state machine, not here."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    CANCELLING = "cancelling"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+RUNNING_STATES = (JobState.RUNNING, JobState.CANCELLING)
+"""In these a job holds its engine, and may commit levels."""
+
+UNFINISHED_STATES = (JobState.QUEUED, *RUNNING_STATES)
+
+
+class PictureKind(StrEnum):
+    """Which picture of a level."""
+
+    REAL = "real"
+    VIRTUAL = "virtual"
+    OVERLAY = "overlay"
+    RESIDUALS = "residuals"
+    UNCERTAINTY = "uncertainty"
+
+
+@dataclass(frozen=True, slots=True)
+class JobRecord:
+    """A job. ``number`` counts jobs in the order of creation; ``last_seq`` is the number of its last event."""
+
+    id: str
+    number: int
+    state: JobState
+    engine: str
+    lens: str
+    request: Mapping[str, Any]
+    created: datetime
+    updated: datetime
+    reason: str | None
+    idempotency_key: str | None
+    last_seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class JobPage:
+    """Some jobs, newest first; ``next_cursor`` asks for those after them, None at the end."""
+
+    jobs: tuple[JobRecord, ...]
+    next_cursor: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class LevelRecord:
+    """A committed level; ``ordinal`` is its place in the job's order of levels, ``attempt`` counts from 1."""
+
+    job_id: str
+    ordinal: int
+    attempt: int
+    result: LevelResult
+
+
+@dataclass(frozen=True, slots=True)
+class EventRecord:
+    """What happened to a job. ``seq`` counts its events without gaps from 1; ``number`` orders those of all jobs."""
+
+    number: int
+    job_id: str
+    seq: int
+    at: datetime
+    kind: str
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class LensRecord:
+    """A lens on a camera, and the newest version of its tables."""
+
+    id: int
+    name: str
+    camera: str
+    latest_version: int
+
+
+@dataclass(frozen=True, slots=True)
+class TableSummary:
+    """A stored lens table without its levels. ``sha256`` is that of its JSON export, in hexadecimal."""
+
+    id: int
+    lens_id: int
+    version: int
+    created: datetime
+    job_id: str | None
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class TableRecord:
+    """A stored lens table."""
+
+    summary: TableSummary
+    table: LensTable
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRecord:
+    """A stored picture: an encoded file."""
+
+    media_type: str
+    data: bytes

@@ -1,0 +1,150 @@
+"""The schema: migrations make what the models say; an upgrade is whole or not at all, with a backup first."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import sqlite3
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+from sqlmodel import Session, SQLModel
+
+from storage.database import MIGRATIONS, Database
+from storage.errors import DatabaseUnusable
+from storage.repository import Repository
+
+MOMENT = datetime(2026, 11, 21, 10, 0, 0, tzinfo=UTC)
+
+NEXT = '''
+"""A revision of tomorrow."""
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0002"
+down_revision = "0001"
+
+
+def upgrade():
+    op.create_table("heads", sa.Column("id", sa.Integer(), primary_key=True))
+    op.add_column("jobs", sa.Column("priority", sa.Integer(), nullable=False, server_default="5"))
+    op.execute("INSERT INTO heads (id) VALUES (1)")
+    {end}
+'''
+
+
+def now() -> datetime:
+    return MOMENT
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "lensmatch.db"
+
+
+@pytest.fixture
+async def job_id(path: Path) -> str:
+    """A database of the first schema that holds one job."""
+    async with await Repository.open(path, now) as repository:
+        return (await repository.create_job({"zooms": 7}, "XA 20x", "r3-a")).id
+
+
+def newer_migrations(folder: Path, end: str = "") -> Path:
+    copy = folder / "migrations"
+    shutil.copytree(MIGRATIONS, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "versions" / "r0002_next.py").write_text(NEXT.replace("{end}", end), encoding="utf-8")
+    return copy
+
+
+def rows(path: Path, query: str) -> list[tuple[object, ...]]:
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        return connection.execute(query).fetchall()
+
+
+def backups(path: Path) -> list[str]:
+    return sorted(entry.name for entry in path.parent.iterdir() if "backup" in entry.name)
+
+
+async def test_the_migrations_make_what_the_models_say(path: Path) -> None:
+    database = await Database.open(path, now)
+
+    def differences(session: Session) -> list[object]:
+        return list(compare_metadata(MigrationContext.configure(session.connection()), SQLModel.metadata))
+
+    try:
+        assert await database.read(differences) == []
+    finally:
+        await database.close()
+
+
+async def test_a_fresh_or_current_database_needs_no_backup(path: Path, job_id: str) -> None:
+    async with await Repository.open(path, now) as repository:
+        assert (await repository.get_job(job_id)).request == {"zooms": 7}
+    assert backups(path) == []
+
+
+async def test_two_processes_may_make_the_database_at_once(path: Path) -> None:
+    opened = await asyncio.gather(*(Repository.open(path, now) for _ in range(4)))
+    for repository in opened:
+        await repository.close()
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
+
+
+async def test_an_upgrade_keeps_the_rows_and_a_backup_of_before(path: Path, job_id: str, tmp_path: Path) -> None:
+    database = await Database.open(path, now, newer_migrations(tmp_path))
+    await database.close()
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
+    assert rows(path, "SELECT id, priority FROM jobs") == [(job_id, 5)]
+    assert backups(path) == ["lensmatch.backup-0001-20261121T100000Z.db"]
+    async with await Repository.open(path.with_name(backups(path)[0]), now) as repository:
+        assert (await repository.get_job(job_id)).lens == "XA 20x"
+
+
+async def test_a_failed_upgrade_leaves_the_old_database(path: Path, job_id: str, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="in the middle"):
+        await Database.open(path, now, newer_migrations(tmp_path, "raise RuntimeError('in the middle')"))
+    assert rows(path, "SELECT name FROM sqlite_master WHERE name = 'heads'") == []
+    async with await Repository.open(path, now) as repository:
+        assert (await repository.get_job(job_id)).lens == "XA 20x"
+
+
+async def test_a_killed_upgrade_leaves_the_old_database(
+    path: Path, job_id: str, tmp_path: Path, repository: Path
+) -> None:
+    migrations = newer_migrations(tmp_path, "import os; os._exit(9)")
+    script = (
+        "import asyncio, sys; from datetime import UTC, datetime; from pathlib import Path; "
+        "from storage.database import Database; "
+        "asyncio.run(Database.open(sys.argv[1], lambda: datetime.now(UTC), Path(sys.argv[2])))"
+    )
+    command = [sys.executable, "-c", script, str(path), str(migrations)]
+    killed = await asyncio.to_thread(subprocess.run, command, cwd=repository, check=False, timeout=60)
+    assert killed.returncode == 9
+    assert len(backups(path)) == 1
+    assert rows(path, "SELECT name FROM sqlite_master WHERE name = 'heads'") == []
+    async with await Repository.open(path, now) as ledger:
+        await ledger.check()
+        assert (await ledger.get_job(job_id)).lens == "XA 20x"
+
+
+async def test_no_backup_no_upgrade(path: Path, job_id: str, tmp_path: Path) -> None:
+    (tmp_path / "lensmatch.backup-0001-20261121T100000Z.db.unfinished").mkdir()
+    migrations = newer_migrations(tmp_path)
+    with pytest.raises(DatabaseUnusable, match="cannot be opened for writing"):
+        await Database.open(path, now, migrations)
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
+    assert rows(path, "SELECT id FROM jobs") == [(job_id,)]
+
+
+async def test_a_database_of_a_newer_version_is_left_alone(path: Path, job_id: str, tmp_path: Path) -> None:
+    database = await Database.open(path, now, newer_migrations(tmp_path))
+    await database.close()
+    with pytest.raises(DatabaseUnusable, match=r"newer version of Lensmatch \(schema 0002, .*; update Lensmatch"):
+        await Repository.open(path, now)
+    assert rows(path, "SELECT id, priority FROM jobs") == [(job_id, 5)]

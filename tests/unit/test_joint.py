@@ -1,0 +1,128 @@
+"""The joint method against perfect detectors: few pictures, the goal reached, everything that can go wrong named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from calibration.compare import overlay
+from calibration.errors import NotEnoughData
+from calibration.lens import Lens
+from calibration.solve.joint import JointMethod
+from calibration.solve.search import Capture, LevelTask, Observation, Source
+from calibration.synthetic import observe
+from calibration.tables import LevelResult, LevelStatus
+from calibration.types import DetectionResult, Refusal, Target, TargetKind, TargetPose
+
+SIZE = (1920, 1080)
+TARGETS = {
+    "large": Target(TargetKind.CHESSBOARD, squares=(9, 7), square_m=0.1, pose=TargetPose((-0.6, 5.0, 1.6))),
+    "small": Target(TargetKind.CHESSBOARD, squares=(8, 6), square_m=0.03, pose=TargetPose((0.35, 5.0, 1.6))),
+}
+Engine = Callable[[Lens], Lens]
+
+
+def task(guess: Lens | None = None) -> LevelTask:
+    return LevelTask(0.5, 0.25, SIZE, TARGETS, (0.0, 0.0, 1.6), guess=guess)
+
+
+def drive(
+    method: JointMethod,
+    truth: Lens,
+    level: LevelTask,
+    *,
+    seed: int = 1,
+    engine: Engine = lambda lens: lens,
+    refuse: Callable[[Capture], str | None] = lambda capture: None,
+) -> tuple[LevelResult, list[Capture]]:
+    rng = np.random.default_rng(seed)
+    captures: list[Capture] = []
+    waiting: list[Capture] = []
+    while not method.done:
+        capture = method.ask()
+        if capture is not None:
+            captures.append(capture)
+            waiting.append(capture)
+            assert len(captures) < 60
+            continue
+        if method.done:
+            break
+        told = waiting.pop(0)
+        pose = level.pose(told.pan_deg, told.tilt_deg)
+        target = level.targets[told.target]
+        why = refuse(told)
+        result: DetectionResult
+        if why:
+            result = Refusal(why)
+        elif told.source is Source.REAL:
+            result = observe(truth, pose, target, rng, 0.02)
+        else:
+            assert told.lens is not None
+            result = observe(engine(told.lens), pose, target, rng, 0.005)
+        method.tell(Observation(told.step, result, pose, f"picture {told.step}"))
+    return method.result(), captures
+
+
+def lens(fov: float, k1_hw: float, k2_hw: float, shift: tuple[float, float] = (5.0, -3.0)) -> Lens:
+    straight = Lens.from_fov(SIZE, fov, center_shift_px=shift)
+    return straight.with_hw(straight.f_px, k1_hw, k2_hw)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [lens(62, -0.1, 0.02), lens(40, -0.03, 0.005), lens(25, 0.0, 0.0), lens(14, 0.02, 0.0), lens(8, 0.03, -0.002)],
+)
+def test_a_level_takes_few_pictures_and_reaches_a_tenth_of_a_pixel(truth: Lens) -> None:
+    level = task()
+    result, captures = drive(JointMethod(level), truth, level)
+    assert result.status is LevelStatus.OK
+    assert len(captures) <= 16
+    assert overlay(truth, result.lens(SIZE)).max_px < 0.15
+    assert result.engine_overlay_px is not None
+    assert result.engine_overlay_px.max < 0.15
+    assert result.reasons["nodal_offset_mm"].startswith("not measured")
+
+
+def test_a_guess_from_the_level_before_saves_a_picture() -> None:
+    truth = lens(40, -0.03, 0.005)
+    level = task(guess=lens(41, -0.03, 0.004))
+    _, with_guess = drive(JointMethod(level), truth, level)
+    _, without = drive(JointMethod(task()), truth, task())
+    assert len(with_guess) <= len(without)
+
+
+def test_an_engine_with_another_lens_model_is_reported_not_believed() -> None:
+    truth = lens(62, -0.1, 0.02)
+    level = task()
+
+    def half_width(values: Lens) -> Lens:  # an engine that takes k1, k2 with radius 1 at half width
+        return values.with_hw(values.f_px, values.k1, values.k2)
+
+    result, _ = drive(JointMethod(level), truth, level, engine=half_width)
+    assert result.status is LevelStatus.DEGRADED
+    assert "the engine's render is up to" in (result.reason or "")
+    assert overlay(truth, result.lens(SIZE)).max_px < 0.15
+
+
+def test_a_target_that_is_nowhere_fails_with_every_reason() -> None:
+    level = task()
+    with pytest.raises(NotEnoughData, match=r"no target was found .*too dark"):
+        drive(JointMethod(level), lens(40, 0, 0), level, refuse=lambda c: "too dark")
+
+
+def test_single_refusals_are_left_out_with_their_reasons() -> None:
+    truth = lens(40, -0.03, 0.005)
+    level = task()
+    result, _ = drive(JointMethod(level), truth, level, refuse=lambda c: "a person in front" if c.step == 3 else None)
+    assert any(out.reason == "a person in front" for out in result.left_out)
+    assert overlay(truth, result.lens(SIZE)).max_px < 0.15
+
+
+def test_an_unreadable_render_leaves_the_level_usable_with_the_reason() -> None:
+    truth = lens(40, -0.03, 0.005)
+    level = task()
+    result, _ = drive(JointMethod(level), truth, level, refuse=lambda c: "black" if c.source is Source.VIRTUAL else None)
+    assert result.engine_overlay_px is None
+    assert "black" in result.reasons["engine_overlay_px"]
