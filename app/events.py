@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import json
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
@@ -301,7 +302,7 @@ def schema_text() -> str:
     for kind in get_args(get_args(AnyEvent)[0]):
         definition = schema["$defs"][kind.__name__]
         definition["properties"] |= envelope
-        definition["required"] = sorted({*envelope, *definition["required"], "kind"})
+        definition["required"] = sorted({*envelope, *definition.get("required", ()), "kind"})
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "An event of a Lensmatch job"}
     return json.dumps({**head, **schema}, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
@@ -27,6 +28,8 @@ def create_app(context: AppContext, running: Sequence[AbstractAsyncContextManage
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        # Made once, in a thread: it takes tenths of a second, which the first client to ask would cost all others.
+        await asyncio.to_thread(app.openapi)
         async with AsyncExitStack() as stack:
             for part in running:
                 await stack.enter_async_context(part)
@@ -70,7 +73,7 @@ def _routes(lifespan: Lifespan[FastAPI] | None) -> FastAPI:
         redoc_url=None,
         redirect_slashes=False,
         lifespan=lifespan,
-        responses=errors.responses("internal"),
+        responses=errors.responses("internal", "storage-busy"),
     )
     for part in (jobs, lenses, service, sockets):
         app.include_router(part.router, prefix=PREFIX)

@@ -36,7 +36,10 @@ class PictureKind(StrEnum):
 
     REAL = "real"
     VIRTUAL = "virtual"
+    BEFORE = "before"
+    """The camera's picture with the target as the engine drew it with the values found in it."""
     OVERLAY = "overlay"
+    """The same with the engine's own render at the published values."""
     RESIDUALS = "residuals"
     UNCERTAINTY = "uncertainty"
 

@@ -26,6 +26,13 @@ log = logging.getLogger("lensmatch.api")
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:lensmatch:problem:"
+HARDENING = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+}
+"""Headers of every response that does not bring its own."""
 MAX_FIELD_ERRORS = 50
 """More wrong fields than a person reads; the first ones are told."""
 
@@ -131,7 +138,7 @@ def problem_response(
         instance=instance,
         errors=list(errors) or None,
     )
-    told = dict(headers or {})
+    told = {**HARDENING, **(headers or {})}
     if kind.retry:
         told.setdefault("Retry-After", str(retry_after_s))
     return JSONResponse(document.model_dump(exclude_none=True), kind.status, told, MEDIA_TYPE)

@@ -14,20 +14,12 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from app.api.errors import problem_response
-from app.settings import Settings
+from app.api.errors import HARDENING, problem_response
+from app.settings import HOST_NAME, Settings
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-_HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::(?P<port>[0-9]{1,5}))?", re.IGNORECASE)
+_HOST = re.compile(rf"(?P<name>{HOST_NAME.pattern})(?::[0-9]{{1,5}})?")
 _HTTP_SCHEMES = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
-_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
-}
-"""On every response that does not bring its own."""
-
 Refusal = tuple[str, str]
 """Name of the problem, and its detail."""
 
@@ -122,7 +114,7 @@ def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
-            for name, value in _HEADERS.items():
+            for name, value in HARDENING.items():
                 headers.setdefault(name, value)
         await send(message)
 

@@ -1,38 +1,63 @@
-"""Pictures of a level for people: the camera's, the engine's, one over the other, and the residuals as arrows."""
+"""Pictures of a level for people: the camera's, the engine's, one over the other before and after, residuals, maps."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from app.jobs.heatmap import heat_map
 from app.jobs.level import LevelOutcome, SeenPicture
 from calibration.camera import project_target
+from calibration.compare import Overlay
 from calibration.errors import CalibrationError
 from calibration.lens import Lens
 from calibration.solve.search import LevelTask
 from calibration.types import FloatArray, Picture
+from engine_adapters.ports import LensValues
 from storage.records import PictureKind
 
 _JPEG_QUALITY = 90
-_GREEN, _MAGENTA, _WHITE, _INK = (80, 220, 60), (255, 60, 255), (255, 255, 255), (40, 40, 40)
-_INSET_ZOOM = 8
+_CAMERA, _ENGINE = (233, 200, 70), (30, 120, 255)
+# Light blue and orange are told apart without colour vision too.
+_WHITE, _INK, _ARROW = (255, 255, 255), (24, 24, 24), (60, 60, 200)
+_INSET_ZOOM, _INSET_HALF = 8, 16
+_ARROW_PX = 14.0
+_FAR_PX = 1e4
+# Beyond this OpenCV's fixed-point coordinates would wrap round.
 
 
-def level_pictures(outcome: LevelOutcome, task: LevelTask, pixel_aspect: float) -> dict[PictureKind, bytes]:
-    """JPEG files by kind; kinds that there is nothing to show for are missing."""
+def level_pictures(
+    outcome: LevelOutcome,
+    task: LevelTask,
+    pixel_aspect: float,
+    *,
+    as_found: LensValues | None = None,
+    expected: Overlay | None = None,
+) -> dict[PictureKind, bytes]:
+    """JPEG files by kind; kinds that there is nothing to show for are missing.
+
+    ``as_found``: the engine's lens before the job changed it. ``expected``: overlay error expected from the fit.
+    """
     files: dict[PictureKind, bytes] = {}
     if outcome.real is not None:
         files[PictureKind.REAL] = jpeg(outcome.real.picture)
+        if as_found is not None:
+            before = before_picture(outcome.real, task, as_found)
+            if before is not None:
+                files[PictureKind.BEFORE] = jpeg(before)
     if outcome.virtual is not None:
         files[PictureKind.VIRTUAL] = jpeg(outcome.virtual.picture)
     if outcome.real is not None and outcome.virtual is not None:
-        files[PictureKind.OVERLAY] = jpeg(overlay_picture(outcome.real, outcome.virtual.detection.points_px))
+        files[PictureKind.OVERLAY] = jpeg(after_picture(outcome.real, outcome.virtual, task))
     if outcome.result.fov_x_deg is not None and outcome.seen:
         lens = outcome.result.lens(task.image_size, pixel_aspect)
-        files[PictureKind.RESIDUALS] = jpeg(residual_picture(outcome, task, lens))
+        files[PictureKind.RESIDUALS] = jpeg(residual_picture(_residuals(outcome, task, lens), task.image_size))
+    if expected is not None:
+        files[PictureKind.UNCERTAINTY] = jpeg(heat_map(expected.map_px, task.image_size))
     return files
 
 
@@ -44,99 +69,162 @@ def jpeg(picture: Picture) -> bytes:
     return bytes(data)
 
 
-def projected(lens: Lens, task: LevelTask, seen: SeenPicture) -> FloatArray | None:
-    """Where ``lens`` puts the points that were found in a picture (N, 2) px; None where it cannot."""
+def before_picture(real: SeenPicture, task: LevelTask, as_found: LensValues) -> Picture | None:
+    """The camera's picture with the target as the engine would have drawn it with the values found in it.
+
+    None where those values make no lens or put the target nowhere.
+    """
     try:
-        points = project_target(lens, task.pose(seen.pan_deg, seen.tilt_deg), task.targets[seen.target])
+        lens = Lens.from_fov(
+            task.image_size,
+            as_found.fov_x_deg,
+            as_found.k1,
+            as_found.k2,
+            as_found.center_shift_px,
+            task.pixel_aspect,
+            as_found.nodal_offset_mm,
+        )
+        drawn_px = project_target(lens, task.pose(real.pan_deg, real.tilt_deg), task.targets[real.target])
     except CalibrationError:
         return None
-    return points[seen.detection.point_ids]
+    values = f"FoV {as_found.fov_x_deg:.2f}°, k1 {as_found.k1:g}, k2 {as_found.k2:g}"
+    return overlay_picture(real, drawn_px, task.targets[real.target].grid, f"engine as found ({values})")
 
 
-def overlay_picture(real: SeenPicture, drawn_px: FloatArray) -> Picture:
-    """The camera's picture with the corners it shows (green) and where the engine draws them (magenta).
+def after_picture(real: SeenPicture, virtual: SeenPicture, task: LevelTask) -> Picture:
+    """The camera's picture with the target where the engine's own last render shows it."""
+    target = task.targets[virtual.target]
+    drawn_px = np.full((target.grid[0] * target.grid[1], 2), np.nan)
+    drawn_px[virtual.detection.point_ids] = virtual.detection.points_px
+    return overlay_picture(real, drawn_px, target.grid, "engine's render at the published values")
 
-    An inset shows the surroundings of one corner eight times larger, crosses at sub-pixel places.
+
+def overlay_picture(real: SeenPicture, drawn_px: FloatArray, grid: tuple[int, int], title: str) -> Picture:
+    """The camera's picture, darkened, with the corners it shows (rings) and the engine's (grid of lines).
+
+    ``drawn_px``: the engine's (N, 2), row by row of the target's ``grid`` (columns, rows), NaN where unknown. The foot
+    says how far they are apart at most; an inset shows the surroundings of that corner eight times larger.
     """
-    canvas = np.asarray((real.picture.astype(np.float32) * 0.75), dtype=np.uint8)
-    found_px = real.detection.points_px
-    for points, colour, size in ((found_px, _GREEN, 7), (drawn_px, _MAGENTA, 4)):
-        for u, v in points[np.isfinite(points).all(axis=1)]:
-            _cross(canvas, u, v, size, colour)
-    worst = _worst(found_px, drawn_px)
-    _inset(canvas, real.picture, found_px, drawn_px, worst)
-    _legend(canvas, [("camera", _GREEN), ("engine", _MAGENTA)])
-    return canvas
+    canvas = _darkened(real.picture)
+    found_px = np.full_like(drawn_px, np.nan)
+    found_px[real.detection.point_ids] = real.detection.points_px
+    reachable = np.abs(drawn_px).max(axis=1, keepdims=True) < _FAR_PX
+    drawn_px = np.where(reachable, drawn_px, np.nan)
+    _grid_lines(canvas, drawn_px, grid)
+    for u, v in found_px[np.isfinite(found_px).all(axis=1)]:
+        _ring(canvas, float(u), float(v), 7.0, _CAMERA, 2)
+    distance = np.linalg.norm(found_px - drawn_px, axis=1)
+    if not np.isfinite(distance).any():
+        return _with_foot(canvas, f"{title}: the target is not in the picture")
+    worst = int(np.nanargmax(distance))
+    if distance[worst] < _INSET_HALF:
+        _inset(canvas, real.picture, found_px[worst], drawn_px[worst])
+    far = float(distance[worst])
+    return _with_foot(
+        canvas, f"{title}: at most {far:.3f} px apart" if far < 1 else f"{title}: up to {far:.1f} px apart"
+    )
 
 
-def residual_picture(outcome: LevelOutcome, task: LevelTask, lens: Lens) -> Picture:
+def residual_picture(pairs: Sequence[tuple[FloatArray, FloatArray]], image_size: tuple[int, int]) -> Picture:
     """Every corner of every picture of the level at its place in the frame, with model minus picture as an arrow.
 
-    The arrows are enlarged so that the RMS of the level is about 12 px long; the scale is written on the picture.
+    ``pairs``: points (N, 2) px and their residuals (N, 2) px of each picture. The arrows are enlarged so that the RMS
+    of the level is about 14 px long; the scale is written on the picture.
     """
-    width, height = task.image_size
-    canvas = np.full((height, width, 3), 250, dtype=np.uint8)
-    pairs = []
-    for seen in outcome.seen:
-        drawn = projected(lens, task, seen)
-        if drawn is not None:
-            pairs.append((seen.detection.points_px, drawn - seen.detection.points_px))
-    if not pairs:
+    width, height = image_size
+    canvas = np.full((height, width, 3), 255, dtype=np.uint8)
+    given = [residual for _, residual in pairs if np.isfinite(residual).any()]
+    if not given:
         return canvas
-    rms = math.sqrt(float(np.nanmean(np.concatenate([r for _, r in pairs]) ** 2)))
-    scale = 12.0 / max(rms, 1e-4)
+    rms = math.sqrt(float(np.nanmean(np.concatenate(given) ** 2)))
+    scale = _ARROW_PX / max(rms, 1e-4)
     for points, residual in pairs:
         for (u, v), (du, dv) in zip(points, residual * scale, strict=True):
-            if math.isfinite(du) and math.isfinite(dv):
+            if math.isfinite(du) and math.isfinite(dv) and max(abs(du), abs(dv)) < _FAR_PX:
                 tip = (round(u + du), round(v + dv))
-                cv2.arrowedLine(canvas, (round(u), round(v)), tip, (60, 60, 200), 1, cv2.LINE_AA, tipLength=0.25)
-    text = f"residuals x {scale:.0f}   RMS per coordinate {rms:.4f} px   {len(pairs)} pictures"
-    cv2.putText(canvas, text, (24, height - 28), cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 2, cv2.LINE_AA)
+                cv2.arrowedLine(canvas, (round(u), round(v)), tip, _ARROW, 2, cv2.LINE_AA, tipLength=0.25)
     cv2.rectangle(canvas, (0, 0), (width - 1, height - 1), (200, 200, 200), 2)
-    return canvas
+    counted = f"{len(pairs)} picture" + ("s" if len(pairs) != 1 else "")
+    return _with_foot(canvas, f"residuals × {scale:.0f}    RMS per coordinate {rms:.4f} px    {counted}")
 
 
-def _worst(found: FloatArray, drawn: FloatArray) -> int:
-    if found.shape != drawn.shape:
-        return 0
-    distance = np.nan_to_num(np.linalg.norm(found - drawn, axis=1), nan=0.0)
-    return int(np.argmax(distance))
+def _residuals(outcome: LevelOutcome, task: LevelTask, lens: Lens) -> list[tuple[FloatArray, FloatArray]]:
+    pairs = []
+    for seen in outcome.seen:
+        try:
+            drawn = project_target(lens, task.pose(seen.pan_deg, seen.tilt_deg), task.targets[seen.target])
+        except CalibrationError:
+            continue
+        found = seen.detection.points_px
+        pairs.append((found, drawn[seen.detection.point_ids] - found))
+    return pairs
 
 
-def _cross(canvas: Picture, u: float, v: float, size: int, colour: tuple[int, int, int]) -> None:
+def _darkened(picture: Picture) -> Picture:
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None].astype(np.float32)
+    return np.asarray(0.35 * picture.astype(np.float32) + 0.35 * grey, dtype=np.uint8)
+
+
+def _fixed(u: float, v: float) -> tuple[int, int]:
     # OpenCV draws at fractions of a pixel with `shift` binary digits.
-    at = (round(u * 16), round(v * 16))
+    return round(u * 16), round(v * 16)
+
+
+def _grid_lines(canvas: Picture, points_px: FloatArray, grid: tuple[int, int]) -> None:
+    columns, rows = grid
+    table = points_px.reshape(rows, columns, 2)
+    pairs = [(table[r, c], table[r, c + 1]) for r in range(rows) for c in range(columns - 1)]
+    pairs += [(table[r, c], table[r + 1, c]) for r in range(rows - 1) for c in range(columns)]
+    for start, end in pairs:
+        if np.isfinite(start).all() and np.isfinite(end).all():
+            cv2.line(canvas, _fixed(*start), _fixed(*end), _ENGINE, 2, cv2.LINE_AA, 4)
+    if not pairs and np.isfinite(points_px).all():
+        _cross(canvas, float(points_px[0, 0]), float(points_px[0, 1]), 9, _ENGINE, 2)
+
+
+def _ring(canvas: Picture, u: float, v: float, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+    cv2.circle(canvas, _fixed(u, v), round(radius * 16), colour, thickness, cv2.LINE_AA, 4)
+
+
+def _cross(canvas: Picture, u: float, v: float, size: int, colour: tuple[int, int, int], thickness: int) -> None:
+    x, y = _fixed(u, v)
     for dx, dy in ((size * 16, 0), (0, size * 16)):
-        cv2.line(canvas, (at[0] - dx, at[1] - dy), (at[0] + dx, at[1] + dy), colour, 1, cv2.LINE_AA, 4)
+        cv2.line(canvas, (x - dx, y - dy), (x + dx, y + dy), colour, thickness, cv2.LINE_AA, 4)
 
 
-def _inset(canvas: Picture, picture: Picture, found: FloatArray, drawn: FloatArray, index: int) -> None:
+def _inset(canvas: Picture, picture: Picture, found: FloatArray, drawn: FloatArray) -> None:
     height, width = picture.shape[:2]
-    half = 16
-    if len(found) == 0 or width < 20 * half or height < 20 * half:
+    half = _INSET_HALF
+    if width < 20 * half or height < 20 * half:
         return
-    u = int(np.clip(round(float(found[index][0])), half, width - half - 1))
-    v = int(np.clip(round(float(found[index][1])), half, height - half - 1))
+    u = int(np.clip(round(float(found[0])), half, width - half - 1))
+    v = int(np.clip(round(float(found[1])), half, height - half - 1))
     crop = picture[v - half : v + half, u - half : u + half]
     side = 2 * half * _INSET_ZOOM
     large: NDArray[np.uint8] = np.asarray(
-        cv2.resize(crop, (side, side), interpolation=cv2.INTER_NEAREST), dtype=np.uint8
+        cv2.resize(_darkened(np.ascontiguousarray(crop)), (side, side), interpolation=cv2.INTER_NEAREST), dtype=np.uint8
     )
-    for points, colour, size in ((found, _GREEN, 60), (drawn, _MAGENTA, 40)):
-        if index < len(points) and np.isfinite(points[index]).all():
-            # The middle of a pixel is half an enlarged pixel in.
-            x = (float(points[index][0]) - (u - half) + 0.5) * _INSET_ZOOM - 0.5
-            y = (float(points[index][1]) - (v - half) + 0.5) * _INSET_ZOOM - 0.5
-            _cross(large, x, y, size, colour)
+    for (x, y), is_camera in ((found, True), (drawn, False)):
+        # The middle of a pixel is half an enlarged pixel in.
+        at = [(float(value) - (middle - half) + 0.5) * _INSET_ZOOM - 0.5 for value, middle in ((x, u), (y, v))]
+        if is_camera:
+            _ring(large, at[0], at[1], 22.0, _CAMERA, 3)
+        else:
+            _cross(large, at[0], at[1], 60, _ENGINE, 2)
     # Put where the corner is not.
-    top = 20 if v > height / 2 else height - side - 20
-    left = 20 if u > width / 2 else width - side - 20
+    top = 24 if v > height / 2 else height - side - 24
+    left = 24 if u > width / 2 else width - side - 24
     canvas[top : top + side, left : left + side] = large
     cv2.rectangle(canvas, (left - 1, top - 1), (left + side, top + side), _WHITE, 2)
+    cv2.rectangle(canvas, (u - half, v - half), (u + half, v + half), _WHITE, 2)
+    label = f"{_INSET_ZOOM}x, the corner farthest off"
+    cv2.putText(canvas, label, (left + 10, top + side - 12), cv2.FONT_HERSHEY_SIMPLEX, 0.65, _WHITE, 1, cv2.LINE_AA)
 
 
-def _legend(canvas: Picture, entries: list[tuple[str, tuple[int, int, int]]]) -> None:
-    for row, (text, colour) in enumerate(entries):
-        at = (28, 44 + 34 * row)
-        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.9, _INK, 5, cv2.LINE_AA)
-        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
+def _with_foot(canvas: Picture, text: str) -> Picture:
+    width = canvas.shape[1]
+    scale = min(1.0, width / 1920)
+    band = np.full((round(56 * scale), width, 3), 255, dtype=np.uint8)
+    at = (round(24 * scale), round(38 * scale))
+    cv2.putText(band, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
+    return np.vstack([canvas, band])

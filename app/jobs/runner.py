@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 from app.documents import JobRequest
@@ -36,14 +37,16 @@ from app.jobs.pictures import level_pictures
 from app.jobs.state import sources
 from app.jobs.sweep import guess_from, level_task, order
 from app.jobs.taking import PictureTaker
+from calibration.compare import Overlay, predicted_overlay
 from calibration.errors import CalibrationError
 from calibration.solve.alternating import AlternatingMethod
 from calibration.solve.joint import JointMethod, JointOptions
 from calibration.solve.search import LevelMethod, LevelTask
 from calibration.tables import LensTable, LevelResult, LevelStatus
 from engine_adapters.errors import AdapterError
+from engine_adapters.ports import LensValues, RenderEngine
 from storage.errors import StorageError
-from storage.records import JobRecord, JobState
+from storage.records import JobRecord, JobState, PictureKind
 from storage.repository import Repository
 
 log = logging.getLogger("lensmatch.jobs")
@@ -62,12 +65,51 @@ class _Worker:
     job: asyncio.Task[None] | None = None
 
 
+class _Background:
+    """At most one task beside the work; always waited for or cancelled."""
+
+    def __init__(self) -> None:
+        self._task: asyncio.Task[None] | None = None
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> None:
+        self._task = asyncio.create_task(work)
+
+    async def finish(self) -> None:
+        if self._task is not None:
+            await self._task
+            self._task = None
+
+    async def cancel(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+            self._task = None
+
+
 def make_method(request: JobRequest, task: LevelTask) -> LevelMethod:
     """The method that a job asks for."""
     if request.method == "alternating":
         return AlternatingMethod(task)
     options = JointOptions(goal_px=request.goal_px, max_views=request.max_views)
     return JointMethod(task, options)
+
+
+def _pictures(
+    outcome: LevelOutcome, method: LevelMethod, task: LevelTask, pixel_aspect: float, as_found: LensValues | None
+) -> dict[PictureKind, bytes]:
+    expected: Overlay | None = None
+    if outcome.result.status is not LevelStatus.FAILED and isinstance(method, JointMethod) and method.fit is not None:
+        expected = predicted_overlay(method.fit.lens, method.fit.covariance)
+    return level_pictures(outcome, task, pixel_aspect, as_found=as_found, expected=expected)
+
+
+async def _lens_as_found(engine: RenderEngine) -> LensValues | None:
+    """The engine's lens before the job changes it, for the picture of before; nothing else depends on it."""
+    try:
+        return await engine.read_lens()
+    except AdapterError as error:
+        log.warning("the engine's lens as found is not known: %s", error)
+        return None
 
 
 class JobRunner:
@@ -207,6 +249,16 @@ class JobRunner:
                 await self._event(job_id, EngineDirty(engine=request.engine, reason=lease.problem or "unknown"))
 
     async def _levels(self, job_id: str, request: JobRequest, lease: Lease) -> list[LevelResult]:
+        drawing = _Background()
+        try:
+            results = await self._measure(job_id, request, lease, drawing)
+            await drawing.finish()
+            return results
+        finally:
+            await drawing.cancel()
+
+    async def _measure(self, job_id: str, request: JobRequest, lease: Lease, drawing: _Background) -> list[LevelResult]:
+        as_found = await _lens_as_found(lease.studio.engine)
         taker = PictureTaker(lease.studio, request.image_size, self._cpu)
         stood = await taker.read_head()
         await taker.measure_delay()
@@ -219,9 +271,14 @@ class JobRunner:
         for ordinal, (zoom, focus) in enumerate(ordered):
             await self._event(job_id, LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus))
             task = level_task(request, zoom, focus, guess_from(results, zoom, request))
-            outcome, problem = await self._level(job_id, ordinal, request, task, taker, lease)
+            method = make_method(request, task)
+            outcome, problem = await self._level(job_id, ordinal, method, task, taker, lease)
             results.append(outcome.result)
-            await self._commit(job_id, ordinal, outcome, task, request)
+            pictures = partial(_pictures, outcome, method, task, request.pixel_aspect, as_found)
+            await self._commit(job_id, ordinal, outcome.result)
+            # Drawn while the next level is measured; one level's pictures at a time are held in memory.
+            await drawing.finish()
+            drawing.begin(self._draw(job_id, ordinal, pictures))
             failures = failures + 1 if problem is not None else 0
             if problem is not None and failures >= _STUDIO_FAILURES and ordinal + 1 < len(ordered):
                 left = len(ordered) - ordinal - 1
@@ -234,7 +291,7 @@ class JobRunner:
         return results
 
     async def _level(
-        self, job_id: str, ordinal: int, request: JobRequest, task: LevelTask, taker: PictureTaker, lease: Lease
+        self, job_id: str, ordinal: int, method: LevelMethod, task: LevelTask, taker: PictureTaker, lease: Lease
     ) -> tuple[LevelOutcome, AdapterError | None]:
         # Each event is a synced commit; they are written beside the pictures, not between them.
         told: asyncio.Queue[AnyEvent | None] = asyncio.Queue()
@@ -246,7 +303,7 @@ class JobRunner:
             while (event := await told.get()) is not None:
                 await self._event(job_id, event)
 
-        run = LevelRun(make_method(request, task), task, taker, self._cpu, lease.studio.transfer, report)
+        run = LevelRun(method, task, taker, self._cpu, lease.studio.transfer, report)
         writer = asyncio.create_task(write(), name=f"events of job {job_id}")
         try:
             try:
@@ -258,10 +315,7 @@ class JobRunner:
             failed = LevelResult.failed(task.zoom, task.focus, str(error))
             return LevelOutcome(failed, None, None, ()), error
 
-    async def _commit(
-        self, job_id: str, ordinal: int, outcome: LevelOutcome, task: LevelTask, request: JobRequest
-    ) -> None:
-        result = outcome.result
+    async def _commit(self, job_id: str, ordinal: int, result: LevelResult) -> None:
         event: AnyEvent
         if result.status is LevelStatus.FAILED:
             reason = result.reason or "unknown"
@@ -270,9 +324,14 @@ class JobRunner:
             event = LevelDone.of(ordinal, result)
         await self._repository.save_level(job_id, ordinal, result, draft(event))
         self._broker.notify(job_id)
-        files = await self._cpu.run(level_pictures, outcome, task, request.pixel_aspect)
-        for picture_kind, data in files.items():
-            await self._repository.save_picture(job_id, ordinal, picture_kind, "image/jpeg", data)
+
+    async def _draw(self, job_id: str, ordinal: int, pictures: Callable[[], dict[PictureKind, bytes]]) -> None:
+        """A level's pictures for people: a courtesy, which never fails a measured level."""
+        try:
+            for kind, data in (await self._cpu.run(pictures)).items():
+                await self._repository.save_picture(job_id, ordinal, kind, "image/jpeg", data)
+        except Exception:
+            log.exception("the pictures of level %d of job %s could not be stored", ordinal, job_id)
 
     async def _finish(self, job_id: str, request: JobRequest, results: list[LevelResult]) -> None:
         if all(result.status is LevelStatus.FAILED for result in results):

@@ -36,7 +36,7 @@ from calibration.types import (
 
 LEAST_SHARE = 0.8
 """At least this share of the corners must be measured."""
-LARGEST_BLUR_SHARE = 0.3
+LARGEST_BLUR_SHARE = 0.27
 """A board whose blur (sigma) exceeds this share of a square's side is refused."""
 _FIRST_HALF_PX = 6
 _SECOND_HALF_PX = 28

@@ -33,6 +33,7 @@ PARAMETERS = 7
 _FIRST_DAMPING = 1e-3
 _LEAST_PIXELS = 21
 _FLAT_STRIDE_PX = 4
+_SMALL_STEPS = (0.02, 0.02, 0.05, 0.02, 0.02)  # angles (rad), ln s, and offset and gain (of the board's contrast)
 _BLOCK_PIXELS = 8000
 _GUESSED_SIGMAS_PX = (0.6, 1.2, 2.4, 4.8, 9.6, 19.2)
 
@@ -238,6 +239,14 @@ def fit_corners(
         if not len(todo):
             break
         step = _solve(normal[todo], slope[todo], damping[todo])
+        close = np.maximum(tolerance_px, 0.03 / np.sqrt(np.maximum(normal[todo, 0, 0], normal[todo, 1, 1])))
+        # So small a step is taken without looking again: what it leaves is smaller still.
+        done = (np.abs(step[:, :2]).max(axis=1) < close) & (damping[todo] <= _FIRST_DAMPING)
+        done &= (np.abs(step[:, 2:]) < _SMALL_STEPS).all(axis=1)
+        best = _placed(best, todo[done], _moved(_taken(best, todo[done]), step[done]))
+        todo, step = todo[~done], step[~done]
+        if not len(todo):
+            break
         trial = _moved(_taken(best, todo), step)
         new_normal, new_slope, new_cost = _normal_equations(signal, windows.of(todo), trial, curvature[todo])
         better = np.isfinite(new_cost) & (new_cost <= cost[todo] * (1 + 1e-3))
@@ -245,8 +254,6 @@ def fit_corners(
         best = _placed(best, good, _taken(trial, np.nonzero(better)[0]))
         normal[good], slope[good], cost[good] = new_normal[better], new_slope[better], new_cost[better]
         damping[todo] = np.where(better, damping[todo] * 0.1, damping[todo] * 10)
-        close = np.maximum(tolerance_px, 0.03 / np.sqrt(np.maximum(normal[todo, 0, 0], normal[todo, 1, 1])))
-        todo = todo[~(better & (np.abs(step[:, :2]).max(axis=1) < close))]
     pixels = windows.used.sum(axis=1).astype(np.int64)
     usable = active & (pixels >= _LEAST_PIXELS)
     covariance = np.full((count, 2, 2), np.nan)

@@ -323,10 +323,9 @@ class _Fit:
                 hessian[block, block] = basis.T @ (basis * weight[:, None]) + 1e-9 * np.eye(basis.shape[1])
                 hessian[block, -1] = hessian[-1, block] = basis.T @ (trust[here] * place_blur[here])
                 gradient[block] = basis.T @ (trust[here] * pull_place[here])
-                if basis.shape[1] == _MOST_TERMS:
-                    fourth = self._fourth_order_sigma(self.curves[index])
-                    hessian[block.stop - 1, block.stop - 1] += 1 / fourth**2
-                    gradient[block.stop - 1] -= self.curves[index].coefficients[-1] / fourth**2
+                bend = self._bend_information(self.curves[index])
+                hessian[block, block] += np.diag(bend)
+                gradient[block] -= bend * self.curves[index].coefficients
             hessian[-1, -1] = float(trust @ blur_blur) + prior
             gradient[-1] = float(trust @ pull_blur) - prior * math.log(self.sigma / _PRIOR_SIGMA_PX)
             step = np.asarray(np.linalg.solve(hessian, gradient), dtype=np.float64)
@@ -346,17 +345,29 @@ class _Fit:
         )
         return float(np.max(np.abs(done), initial=0.0))
 
-    def _fourth_order_sigma(self, curve: Curve) -> float:
-        """Prior standard deviation (px, mean 0) of the coefficient of t^4.
+    def _bend_information(self, curve: Curve) -> FloatArray:
+        """Prior information (1 / px^2, mean 0) on a curve's coefficients: how far a lens bends a straight side.
 
-        A straight side at distance d from the centre, bent by radial distortion, has the sagitta a2 = d k1 l^2 and
-        a fourth order of about 2 a2^2 / d + a2 (k2 / k1) l^2 (l: half length in focal lengths); the noise would
-        otherwise be extrapolated with the highest order into the corners.
+        A straight side at distance d from the picture's centre, half length l (both over the picture's half width h),
+        bent by radial distortion, has the second order d k1 l^2 h, a fourth order of about
+        2 d k1^2 l^4 h + d k2 l^4 h, and a third order that many times 4 x0 / l, with x0 the distance of its middle
+        from the foot of the perpendicular. So the second order is loosely bound, as k1 = 0 +- 0.15, which pulls weak
+        data only; the higher ones follow the second. Without this, noise is extrapolated into the corners with the
+        highest order.
         """
         height, width = self._size
-        sagitta = abs(float(curve.coefficients[2]))
-        distance = abs(float(curve.coefficients[0]) - ((height if curve.along_rows else width) - 1) / 2)
-        return 0.002 + 3 * sagitta**2 / max(distance, curve.half / 2) + 0.3 * sagitta * (2 * curve.half / width) ** 2
+        along, across = (width, height) if curve.along_rows else (height, width)
+        middle = abs(curve.middle - (along - 1) / 2)
+        distance = abs(float(curve.coefficients[0]) - (across - 1) / 2)
+        terms = len(curve.coefficients)
+        sigma = np.full(_MOST_TERMS, np.inf)
+        if terms > 2:
+            sagitta = abs(float(curve.coefficients[2]))
+            short = (2 * curve.half / width) ** 2
+            sigma[2] = 0.01 + 0.15 * (distance + curve.half) * short
+            sigma[4] = 0.002 + 3 * sagitta**2 / max(distance, curve.half / 2) + 0.3 * sagitta * short
+            sigma[3] = sigma[4] * (1 + 4 * middle / curve.half)
+        return np.asarray(1 / sigma[:terms] ** 2)
 
     def _trust_of_residuals(self, off_px: FloatArray, information: FloatArray, *, settled: bool) -> FloatArray:
         """Weight 0..1 of each line: small where it lies off its side's curve or fits far worse than the others."""

@@ -17,6 +17,7 @@ from calibration.detect.saddle import Saddles, sample
 from calibration.types import FloatArray, IntArray
 
 NEIGHBOURS_ASKED = 20
+MOST_GRIDS = 12
 _CROSSED_RAD = np.deg2rad(40)
 _QUADRANT_MARGIN_RAD = np.deg2rad(10)
 _AMPLITUDE_RATIO = 4.0
@@ -52,16 +53,18 @@ class Grid:
         return int(np.isfinite(self.points[..., 0]).sum())
 
 
-def find_grids(saddles: Saddles, least: int = 4) -> list[Grid]:
-    """All grids of at least ``least`` linked corners, the one with most corners first."""
+def find_grids(saddles: Saddles, least: int = 4, longest: int = 20) -> list[Grid]:
+    """The ``MOST_GRIDS`` largest grids of at least ``least`` linked corners, the one with most corners first.
+
+    A grid that is longer than ``longest`` is not completed further: its size is then too small by what is missing.
+    """
     if len(saddles.points) < least:
         return []
     neighbours = _link(saddles)
     weak = cKDTree(saddles.weak)
     grids: list[Grid] = []
-    for places in _walk(neighbours):
-        if len(places) < least:
-            continue
+    pieces = sorted((places for places in _walk(neighbours) if len(places) >= least), key=len, reverse=True)
+    for places in pieces[:MOST_GRIDS]:
         columns = [place[0] for place in places.values()]
         rows = [place[1] for place in places.values()]
         width, height = max(columns) - min(columns) + 1, max(rows) - min(rows) + 1
@@ -70,7 +73,7 @@ def find_grids(saddles: Saddles, least: int = 4) -> list[Grid]:
         points = np.full((height, width, 2), np.nan)
         for index, (column, row) in places.items():
             points[row - min(rows), column - min(columns)] = saddles.points[index]
-        grid = _complete(points, saddles, float(np.median(saddles.amplitude[list(places)])), weak)
+        grid = _complete(points, saddles, float(np.median(saddles.amplitude[list(places)])), weak, longest)
         if grid is not None:
             grids.append(grid)
     return sorted(grids, key=lambda grid: -grid.present)
@@ -168,6 +171,15 @@ def steps_of(points: FloatArray) -> FloatArray:
     return steps
 
 
+def mean_steps(points: FloatArray) -> FloatArray:
+    """(2, 2): the mean step along columns and along rows, NaN where no two neighbours are there."""
+    steps = steps_of(points).reshape(-1, 2, 2)
+    known = np.isfinite(steps)
+    total = np.where(known, steps, 0.0).sum(axis=0)
+    count = known.sum(axis=0)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan), dtype=np.float64)
+
+
 def predict_missing(points: FloatArray) -> FloatArray:
     """Where the points of a grid are expected from their neighbours along rows and columns, NaN where nothing tells."""
     guesses: list[FloatArray] = []
@@ -205,7 +217,7 @@ def corner_pattern(saddles: Saddles, points: FloatArray, steps: FloatArray) -> F
     return np.asarray(np.where(bright, low, np.where(dark, high, 0.0)), dtype=np.float64)
 
 
-def _complete(points: FloatArray, saddles: Saddles, amplitude: float, weak: cKDTree) -> Grid | None:
+def _complete(points: FloatArray, saddles: Saddles, amplitude: float, weak: cKDTree, longest: int) -> Grid | None:
     """Fill holes and add rows and columns that the links missed, drop stray points; None where nothing holds up."""
     strength = _strengths(points, saddles)
     parity = _parity(points.shape[0], points.shape[1])
@@ -217,7 +229,9 @@ def _complete(points: FloatArray, saddles: Saddles, amplitude: float, weak: cKDT
         return None
     polarity = _polarity(points, saddles)
     size = (saddles.gray.shape[1], saddles.gray.shape[0])
-    for _ in range(2 * _LARGEST_SIDE):
+    for _ in range(longest):
+        if max(points.shape[:2]) > longest:
+            break
         grown = np.full((points.shape[0] + 2, points.shape[1] + 2, 2), np.nan)
         grown[1:-1, 1:-1] = points
         expected = predict_missing(grown)
@@ -238,7 +252,7 @@ def _complete(points: FloatArray, saddles: Saddles, amplitude: float, weak: cKDT
         flips = (1 - (rows.start or 0)) + (1 - (columns.start or 0))
         changed = new.shape != points.shape or int(np.isfinite(new).sum()) != int(np.isfinite(points).sum())
         points, polarity = new, polarity * (-1) ** flips
-        if not changed or max(points.shape[:2]) > _LARGEST_SIDE:
+        if not changed:
             break
     return Grid(points, polarity, amplitude)
 

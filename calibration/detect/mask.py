@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,25 +56,31 @@ class ColourField:
 def colour_field(picture: Picture, colour: str, transfer: Transfer) -> ColourField:
     """The field of a colour named in ``KNOWN_COLOURS`` over a picture (H, W, 3), BGR. Raises KeyError."""
     table = light_table(transfer)
-    planes = [table[picture[:, :, channel]] for channel in range(3)]
+
+    def light(coded: NDArray[np.uint8]) -> Channel:
+        return np.asarray(cv2.LUT(coded, table), dtype=np.float32)
+
+    # The curve rises, so that the largest and smallest channel may be taken on coded values.
+    planes = [np.ascontiguousarray(picture[:, :, channel]) for channel in range(3)]
+    top = light(np.maximum(np.maximum(planes[0], planes[1]), planes[2]))
     if colour == "black":
-        brightest = np.maximum(np.maximum(planes[0], planes[1]), planes[2])
-        strength = (1.0 - np.sqrt(brightest)).astype(np.float32)
+        strength = np.asarray(1.0 - np.sqrt(top), dtype=np.float32)
         return ColourField(strength, strength, tuple((strength, level) for level in _BLACK_LEVELS))
     bright = _BRIGHT_CHANNELS[colour]
     own = planes[bright[0]]
     for channel in bright[1:]:
         own = np.minimum(own, planes[channel])
-    top = np.maximum(np.maximum(planes[0], planes[1]), planes[2])
     dark = [planes[channel] for channel in range(3) if channel not in bright]
-    strength = own
+    strength = light(own)
     if dark:
         other = dark[0] if len(dark) == 1 else np.maximum(dark[0], dark[1])
-        strength = np.maximum(own - other, np.float32(0.0))
-    purity = np.where(strength > _LEAST_STRENGTH, strength / np.maximum(top, np.float32(1e-6)), np.float32(0.0))
+        strength = np.maximum(strength - light(other), np.float32(0.0))
+    purity = np.asarray(strength / np.maximum(top, np.float32(1e-4)), dtype=np.float32)
+    # Where there is hardly any light the ratio of the channels is noise, and so would be the outlines.
+    lit = purity * (strength > _LEAST_STRENGTH)
     strongest = float(strength.max(initial=0.0))
     levels = tuple(
         (strength, share * strongest) for share in _STRENGTH_SHARES if share * strongest > _LEAST_STRENGTH / 2
     )
-    levels += tuple((purity, level) for level in _PURITY_LEVELS)
+    levels += tuple((lit, level) for level in _PURITY_LEVELS)
     return ColourField(strength, purity, levels)

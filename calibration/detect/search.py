@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.detect.grid import Grid, find_grids, predict_missing, steps_of
+from calibration.detect.grid import Grid, find_grids, mean_steps, predict_missing, steps_of
 from calibration.detect.prediction import Prediction
 from calibration.detect.quality import median_sides
 from calibration.detect.saddle import Gray, find_saddles, reduce_picture
@@ -55,7 +55,9 @@ def find_board(
     least = max(4, round(_LEAST_REPORTED * size[0] * size[1]))
     for factor, gray in _levels(part, colours, near, size):
         grids = [
-            grid for grid in find_grids(find_saddles(gray), least) if factor == 1 or _step(grid) > _SMALLEST_STEP_PX
+            grid
+            for grid in find_grids(find_saddles(gray), least, max(size) + 2)
+            if factor == 1 or _step(grid) > _SMALLEST_STEP_PX
         ]
         boards: list[Board] = []
         for grid in grids:
@@ -86,7 +88,7 @@ def upright(grid: Grid, size: tuple[int, int], near: Prediction | None = None) -
     for _ in range(4):
         if (points.shape[1], points.shape[0]) == size:
             if near is None:
-                steps = np.nanmean(steps_of(points).reshape(-1, 2, 2), axis=0)
+                steps = mean_steps(points)
                 lengths = np.linalg.norm(steps, axis=1)
                 value = float(steps[0, 0] / lengths[0] + steps[1, 1] / lengths[1])
             else:
@@ -215,7 +217,7 @@ def _reason(others: list[Grid], size: tuple[int, int], picture: Picture, near: P
         return f"no chessboard pattern found{place} (not in view, too dark, too blurred, or its squares too small)"
     grid = max(seen, key=lambda grid: grid.present * grid.amplitude)
     turned = upright(grid, grid.size) or grid
-    steps = np.nanmean(steps_of(turned.points).reshape(-1, 2, 2), axis=0)
+    steps = mean_steps(turned.points)
     columns, rows = turned.size
     if abs(steps[0, 0]) < abs(steps[0, 1]):
         columns, rows = rows, columns

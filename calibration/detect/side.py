@@ -8,8 +8,9 @@ import numpy as np
 
 from calibration.types import FloatArray
 
-SYSTEMATIC_PX = 0.008
-"""Standard deviation of what the Gaussian model leaves of a real pixel response, per side and line direction."""
+SYSTEMATIC_PX, SYSTEMATIC_OF_BLUR = 0.006, 0.006
+"""Standard deviation of what the Gaussian model leaves of a real side: of the pixel response, and, as a share of the
+blur's sigma, of a blur of another shape (a defocus disk) and of what lies behind within its reach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +85,7 @@ def corner_of(first: Side, second: Side, near: FloatArray) -> tuple[FloatArray, 
             value, slope, spread = side.at(float(x))
             rows.append([-slope, 1.0] if side.along_rows else [1.0, -slope])
             values.append(value - y)
-            variance[index] = spread + SYSTEMATIC_PX**2
+            variance[index] = spread + (SYSTEMATIC_PX + SYSTEMATIC_OF_BLUR * side.sigma_px) ** 2
         jacobian = np.array(rows)
         if abs(np.linalg.det(jacobian)) < 0.1:
             return None

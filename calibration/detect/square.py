@@ -33,7 +33,7 @@ from calibration.types import (
 LEAST_SIDE_PX = 12.0
 """Shortest side that is measured."""
 
-_COARSE_WIDTH = 1280
+_COARSE_WIDTH = 960
 _COARSE_MOST_FACTOR = 3
 # The best candidate must beat the next by this factor; two squares of one colour and nearly one size are a tie.
 _CLEARLY_BETTER = 1.35
@@ -91,7 +91,7 @@ def _search(
         return Refusal("the expected place of the square lies outside the picture")
     left, top, right, bottom = window
     part = picture[top:bottom, left:right]
-    factor = max(1, min(_COARSE_MOST_FACTOR, round(max(part.shape[:2]) / (_COARSE_WIDTH * 0.75))))
+    factor = max(1, min(_COARSE_MOST_FACTOR, round(max(part.shape[:2]) / _COARSE_WIDTH)))
     small = part
     if factor > 1:
         size = (max(1, part.shape[1] // factor), max(1, part.shape[0] // factor))
@@ -104,7 +104,7 @@ def _search(
     quads = find_quads(field, size_m, frame_edges=edges)
     if near is not None:
         quads = [quad for quad in quads if quad.cut or _agrees(quad.corners * scale + offset, near)]
-    found = _choose(quads, colour, float(scale.mean()), narrowed=near is not None)
+    found = _choose(quads, colour, scale, offset, narrowed=near is not None)
     if isinstance(found, Refusal):
         return found
     return found.corners * scale + offset, 2.0 * float(scale.max()) + 0.02 * found.side * float(scale.mean())
@@ -128,19 +128,22 @@ def _agrees(clockwise: FloatArray, near: Prediction) -> bool:
     return bool(np.max(off) < 4 * near.sigma_px + 4 + 0.05 * side)
 
 
-def _choose(quads: list[Quad], colour: str, scale: float, *, narrowed: bool) -> Quad | Refusal:
-    """The target among the candidates, or why it cannot be told."""
+def _choose(quads: list[Quad], colour: str, scale: FloatArray, offset: FloatArray, *, narrowed: bool) -> Quad | Refusal:
+    """The target among the candidates, or why it cannot be told; a place is px = reduced px * scale + offset."""
     whole = [quad for quad in quads if not quad.cut]
     cut = [quad for quad in quads if quad.cut]
     where = " where it is expected" if narrowed else ""
     if cut and (not whole or cut[0].score > whole[0].score):
-        u, v = cut[0].corners.mean(axis=0) * scale
-        if cut[0].side * scale >= LEAST_SIDE_PX:
-            return Refusal(f"the {colour} square is cut by the picture's frame (near u {u:.0f}, v {v:.0f})")
+        u, v = cut[0].corners.mean(axis=0) * scale + offset
+        if cut[0].side * scale.min() >= LEAST_SIDE_PX:
+            return Refusal(
+                f"the likeliest {colour} square, near u {u:.0f}, v {v:.0f}, is cut by the picture's frame: "
+                "move the camera or the target"
+            )
     if not whole:
         return Refusal(f"no {colour} square was found{where}")
-    if len(whole) > 1 and whole[0].score < _CLEARLY_BETTER * whole[1].score and not narrowed:
-        a, b = (quad.corners.mean(axis=0) * scale for quad in whole[:2])
+    if len(whole) > 1 and whole[0].score <= _CLEARLY_BETTER * whole[1].score and not narrowed:
+        a, b = (quad.corners.mean(axis=0) * scale + offset for quad in whole[:2])
         return Refusal(
             f"two {colour} squares are equally likely, near ({a[0]:.0f}, {a[1]:.0f}) and ({b[0]:.0f}, {b[1]:.0f}): "
             "cover one of them"

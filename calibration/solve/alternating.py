@@ -11,10 +11,10 @@ NO corner deviates by more than a threshold.
 
 It is tuned so that it does what the principle allows. Where the study is silent: the first picture's target size
 starts the field of view; slopes are remembered from one search to the next; each search goes on to its lowest point
-and the rounds to their standstill, because at the threshold alone k2 is more than 10 % off on four lenses of ten; the
-corner is looked at before k2 is called 0; and FoV takes part in the rounds with k2, because a field of view found
-without k2 leaves k2 10 % off. Edge and corner lie close together, so that k1 and k2 stand in for each other and the
-rounds creep: about 25 renders in scenario 1, 100 in scenario 2.
+and the rounds to their standstill, because at the threshold alone four lenses of ten miss the study's goals; the
+corner is looked at before k2 is called 0; and FoV takes part in the rounds with k2, because the one found without k2
+is biased by it. Edge and corner lie close together, so that k1 and k2 stand in for each other and the rounds creep:
+about 25 renders in scenario 1, 100 in scenario 2, up to 400 where the target spans much of the picture.
 """
 
 from __future__ import annotations

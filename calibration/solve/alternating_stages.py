@@ -11,7 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from calibration.lens import Lens
+from calibration.lens import Lens, fov_to_f_px
 from calibration.solve.alternating_pictures import AlternatingSettings, Pictures, Steps, Stopped, Trial, View
 from calibration.solve.search import LevelTask
 from calibration.types import FloatArray, Role
@@ -32,6 +32,8 @@ _TRUST_SLOPE = 10.0
 # A slope is renewed from a step that moved the corners by this many times their noise.
 
 
+_FOV_RANGE_DEG = (0.05, 170.0)
+# Only a field of view that has no effect in the engine is moved as far as this.
 _PLACES = (Role.FOV, Role.K1, Role.K2)
 
 
@@ -245,5 +247,6 @@ class Procedure:
             return replace(lens, k1=lens.k1 + by)
         if coefficient is Coefficient.K2:
             return replace(lens, k2=lens.k2 + by)
-        fov = Lens.from_fov(lens.image_size, lens.fov_x_deg + by)
-        return replace(lens, f_px=fov.f_px)
+        low, high = _FOV_RANGE_DEG
+        fov_x_deg = min(max(lens.fov_x_deg + by, low), high)
+        return replace(lens, f_px=fov_to_f_px(fov_x_deg, lens.image_size[0]))

@@ -25,16 +25,19 @@ from calibration.types import Detection, FloatArray, Refusal, Role, Target
 
 _PLACES: tuple[tuple[float, float, Role], ...] = (
     (1.0, 1.0, Role.K2),
-    (-1.0, -1.0, Role.K2),
     (1.0, -1.0, Role.K2),
+    (-1.0, -1.0, Role.K2),
     (-1.0, 1.0, Role.K2),
     (-1.0, 0.0, Role.K1),
+    (0.0, 1.0, Role.FREE),
     (1.0, 0.0, Role.K1),
     (0.0, -1.0, Role.FREE),
-    (0.0, 1.0, Role.FREE),
 )
+# Round the picture, so that the head travels little.
 _FIRST_PLACE = (0.6, 0.4, Role.FOV)
 # Before the distortion is known, a target sent to the very corner may be bent out of the picture.
+_BEND_KNOWN_PX = 20.0
+# Expected overlay error below which a fit is good enough to aim with: about half the margin kept at the border.
 _FIRST_GUESS_FOV_DEG = 40.0
 # Only aims the head at a target in the middle, which hardly depends on it.
 
@@ -216,7 +219,7 @@ class JointMethod:
 
     def _angles_for(self, place: tuple[float, float, Role]) -> tuple[float, float]:
         """Head angles that put the target as far towards ``place`` as its outline stays inside the picture."""
-        lens, target = self._lens(), self._task.targets[self._target]
+        lens, target = self._planning_lens(), self._task.targets[self._target]
         width, height = lens.image_size
         margin = self._options.margin * width
         reach = np.array([(width - 1) / 2 - margin, (height - 1) / 2 - margin])
@@ -230,9 +233,21 @@ class JointMethod:
                 pixel = (pixel + centre) / 2
             else:
                 over = np.maximum(outline.max(axis=0) - centre, centre - outline.min(axis=0))
-                pixel = pixel + np.where(direction != 0, np.sign(direction), 0.0) * (reach * np.abs(direction) - over)
+                pixel = pixel + np.sign(direction) * (reach * np.abs(direction) - over)
+            pixel = np.clip(pixel, centre - reach, centre + reach)
             pan, tilt = aim_at(lens, self._task, target, (float(pixel[0]), float(pixel[1])))
         return pan, tilt
+
+    def _planning_lens(self) -> Lens:
+        """The fitted lens; while one picture in the middle tells its bend badly, that of the guess, or none at all."""
+        lens = self._lens()
+        if self._fit is not None and predicted_overlay(lens, self._fit.covariance).max_px <= _BEND_KNOWN_PX:
+            return lens
+        guess = self._task.guess
+        straight = Lens(
+            lens.image_size, lens.f_px, pixel_aspect=lens.pixel_aspect, nodal_offset_mm=lens.nodal_offset_mm
+        )
+        return straight if guess is None else straight.with_hw(lens.f_px, guess.k1_hw, guess.k2_hw)
 
     def _outline(self, lens: Lens, target: Target, pan: float, tilt: float) -> FloatArray:
         width_m, height_m = target.outline_m()
@@ -269,7 +284,7 @@ class JointMethod:
             return
         usable = [v for v in self._views if v.name not in {name for name, _ in self._fit.dropped}]
         # The last picture's pose first: the head stands there already.
-        self._checks = [usable[-1], *usable[1:-1]][: self._options.verify_views]
+        self._checks = usable[::-1][: self._options.verify_views]
         self._stage = _Stage.VERIFY
         if not self._checks:
             self._stage = _Stage.DONE

@@ -239,9 +239,7 @@ class _Fit:
         evaluation = self.problem.evaluate(self.state)
         cost = self._cost(evaluation, whiten, robust)
         if not math.isfinite(cost):
-            raise NotEnoughData(
-                "the start puts points where no lens draws; give a guess for the field of view"
-            )
+            raise NotEnoughData("the start puts points where no lens draws; give a guess for the field of view")
         moved = math.inf
         for _ in range(_ITERATIONS):
             self.iterations += 1

@@ -205,6 +205,11 @@ class R3Client:
         self._closed = False
         self._lost = False
 
+    @property
+    def connected(self) -> bool:
+        """Whether a connection is open now; the next command opens one where there is none."""
+        return self._connection is not None and self._connection.state is not ConnectionState.CLOSED
+
     async def run(self, command: Command[T]) -> T:
         """Send a command once and return its answer. Raises what :meth:`R3Connection.exchange` raises.
 

@@ -6,10 +6,10 @@ import base64
 import time
 from enum import StrEnum
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.image import cv2
 from calibration.types import Picture
 from engine_adapters.sim.optics import View
 from engine_adapters.sim.render import render_real, render_virtual
@@ -124,7 +124,7 @@ class _Timed:
         self._statistics.render_ms_total += (time.thread_time() - self._began) * 1000.0
 
 
-def encode_picture(picture: Picture, picture_format: PictureFormat) -> bytes:
+def encode_picture(picture: Picture, picture_format: PictureFormat) -> memoryview:
     """The picture as a file."""
     options = {
         PictureFormat.PNG: [cv2.IMWRITE_PNG_COMPRESSION, 1],
@@ -140,4 +140,4 @@ def encode_picture(picture: Picture, picture_format: PictureFormat) -> bytes:
     done, data = cv2.imencode("." + picture_format.value, picture, options)
     if not done:
         raise RuntimeError(f"the {picture_format} encoder failed")
-    return bytes(data)
+    return np.asarray(data, dtype=np.uint8).reshape(-1).data

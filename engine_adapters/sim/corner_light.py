@@ -99,9 +99,7 @@ class CornerLight:
         self._parts = np.stack([margin, (first + second) / 2.0 - margin, (first - second) / 2.0])
         self._covering = _PANEL if panel.margin_m > 0.0 else _AREA
 
-    def at(
-        self, u: FloatArray, v: FloatArray, behind: NDArray[np.uint8]
-    ) -> tuple[LightArray, NDArray[np.bool_]]:
+    def at(self, u: FloatArray, v: FloatArray, behind: NDArray[np.uint8]) -> tuple[LightArray, NDArray[np.bool_]]:
         """Linear light (N, 3) at pixels over what lies ``behind`` them (N, 3 coded); which ones have a ray at all."""
         x, y = self._table.rays(u, v)
         seen = np.isfinite(x)

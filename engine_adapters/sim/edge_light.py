@@ -30,7 +30,7 @@ IndexArray = NDArray[np.intp]
 _SAMPLES = 25
 _STEPS_PER_SIGMA = 512
 _REACH_SIGMAS = 4.0
-_NEWTON_STEPS = 2
+_LEAST_SLANT = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +124,14 @@ class EdgeLight:
         edges, others = self._grid.edges[axis], self._grid.edges[1 - axis]
         samples = np.linspace(others[0], others[-1], _SAMPLES)
         fixed, running = np.repeat(edges, _SAMPLES), np.tile(samples, len(edges))
-        pixels, _ = self._project(axis, fixed, running)
-        pixels = pixels.reshape(len(edges), _SAMPLES, 2)
-        travel = np.abs(pixels[:, -1] - pixels[:, 0])
+        camera = self._origin + np.outer(fixed, self._along[axis]) + np.outer(running, self._along[1 - axis])
+        paths = self._view.to_pixels(camera).reshape(len(edges), _SAMPLES, 2)
+        travel = np.abs(paths[:, -1] - paths[:, 0])
         runs_upright = travel[:, 1] >= travel[:, 0]
         along = 1 if upright else 0
         chosen_lines, chosen_guess, chosen_edge = [], [], []
         for number in np.flatnonzero(runs_upright == upright):
-            path, across = pixels[number, :, along], pixels[number, :, 1 - along]
+            path, across = paths[number, :, along], paths[number, :, 1 - along]
             if across.max() < -self._reach_px or across.min() > length - 1 + self._reach_px:
                 continue
             order = path if path[-1] >= path[0] else path[::-1]
@@ -145,39 +145,45 @@ class EdgeLight:
         if not chosen_lines:
             return None
         line, running, edge = np.concatenate(chosen_lines), np.concatenate(chosen_guess), np.concatenate(chosen_edge)
-        fixed = edges[edge]
-        for _ in range(_NEWTON_STEPS):
-            pixels, tangent = self._project(axis, fixed, running)
-            running = running + (line - pixels[:, along]) / tangent[:, along]
-        pixels, tangent = self._project(axis, fixed, running)
-        at = pixels[:, 1 - along]
+        pixels, tangent, reached = self._project(axis, edges[edge], running)
+        # The guess is a tenth of a pixel off at most; one Newton step leaves the square of that times the curvature.
+        step = (line - pixels[along]) / tangent[along]
+        running = running + step
+        at = pixels[1 - along] + tangent[1 - along] * step
         # Far side of an edge: growing "right" (axis 0) or "down" (axis 1) in the panel. With the panel's face to the
         # camera, right x down keeps its sign in the picture, so the tangent's own sign tells on which side it lies.
         sign = 1.0 if (axis == 0) == upright else -1.0
-        slant = sign * tangent[:, along] / np.hypot(tangent[:, 0], tangent[:, 1])
+        slant = sign * tangent[along] / np.hypot(*tangent)
         cell = np.searchsorted(others, running)
         areas = self._grid.areas if axis == 0 else self._grid.areas.T
         near, far = areas[cell, edge], areas[cell, edge + 1]
         kept = (near != far) & (at > -self._reach_px) & (at < length - 1 + self._reach_px)
-        kept &= np.abs(slant) > 0.3
+        kept &= reached & (np.abs(slant) > _LEAST_SLANT)
         if not kept.any():
             return None
         return _Crossings(*(part[kept] for part in (line, at, slant, near, far)))
 
-    def _project(self, axis: int, fixed: FloatArray, running: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (N, 2) of points on edges across ``axis``, and their derivative by the running coordinate (N, 2)."""
-        camera = self._origin + np.outer(fixed, self._along[axis]) + np.outer(running, self._along[1 - axis])
-        pixels = self._view.to_pixels(camera)
+    def _project(
+        self, axis: int, fixed: FloatArray, running: FloatArray
+    ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray], NDArray[np.bool_]]:
+        """Pixels (u, v) of points on edges across ``axis``, their derivative by the running coordinate, and which of
+        them a ray of the picture reaches (beyond it the polynomial may fold back into the picture)."""
         optics = self._view.optics
-        inverse_depth = 1.0 / camera[:, 2]
-        x, y = camera[:, 0] * inverse_depth, camera[:, 1] * inverse_depth
+        fixed_x, fixed_y, fixed_z = self._along[axis]
         dx, dy, dz = self._along[1 - axis]
+        origin_x, origin_y, origin_z = self._origin
+        inverse_depth = 1.0 / (origin_z + fixed * fixed_z + running * dz)
+        x = (origin_x + fixed * fixed_x + running * dx) * inverse_depth
+        y = (origin_y + fixed * fixed_y + running * dy) * inverse_depth
         x_t, y_t = (dx - x * dz) * inverse_depth, (dy - y * dz) * inverse_depth
         q = x * x + y * y
         scale = 1.0 + q * (optics.k1 + optics.k2 * q)
         scale_t = (2.0 * optics.k1 + 4.0 * optics.k2 * q) * (x * x_t + y * y_t)
-        tangent = np.column_stack([x_t * scale + x * scale_t, (y_t * scale + y * scale_t) * optics.pixel_aspect])
-        return pixels, tangent * optics.f_px
+        f_u, f_v = optics.f_px, optics.f_px * optics.pixel_aspect
+        cu, cv = optics.center_px
+        pixels = f_u * x * scale + cu, f_v * y * scale + cv
+        tangent = f_u * (x_t * scale + x * scale_t), f_v * (y_t * scale + y * scale_t)
+        return pixels, tangent, q <= self._view.picture_radius**2
 
 
 @lru_cache(maxsize=32)

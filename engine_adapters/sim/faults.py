@@ -73,7 +73,9 @@ def parse_fault(spec: str) -> Fault:
     try:
         target = FaultTarget(match["target"])
     except ValueError as error:
-        raise SimulatorError(f"no server is called {match['target']}; there are r3 and mockboard", where=where) from error
+        raise SimulatorError(
+            f"no server is called {match['target']}; there are r3 and mockboard", where=where
+        ) from error
     try:
         kind = FaultKind(match["kind"])
     except ValueError as error:

@@ -55,7 +55,7 @@ class LensLevel:
 
 
 class ZoomLens:
-    """A zoom lens of known truth. ``name``, ``image_size`` (W, H), ``sensor_mm`` (w, h), ``pixel_aspect``, ``levels``."""
+    """A zoom lens of known truth: ``name``, ``image_size``, ``sensor_mm`` (width, height), aspect and ``levels``."""
 
     def __init__(
         self,
@@ -193,7 +193,8 @@ def parse_lens(content: object, *, where: str = "lens truth") -> ZoomLens:
     width, height = (_number(side, "image_size", where) for side in _pair(content, "image_size", where))
     if not (2 <= width <= MAX_PICTURE_SIDE and 2 <= height <= MAX_PICTURE_SIDE) or width % 1 or height % 1:
         raise SimulatorError(
-            f"image_size {width:g} x {height:g} is no picture size (whole numbers, 2 to {MAX_PICTURE_SIDE})", where=where
+            f"image_size {width:g} x {height:g} is no picture size (whole numbers, 2 to {MAX_PICTURE_SIDE})",
+            where=where,
         )
     sensor_w, sensor_h = (_number(side, "sensor_mm", where) for side in _pair(content, "sensor_mm", where))
     aspect = _number(content.get("pixel_aspect", 1.0), "pixel_aspect", where)
@@ -242,13 +243,11 @@ def _level(raw: object, where: str, image_size: tuple[int, int], aspect: float) 
             raise SimulatorError(f"{name} {values[name]:g} is not between 0 and 50", where=where)
     if max(abs(shift_x), abs(shift_y)) > max(image_size) / 4:
         raise SimulatorError(f"center_shift_px ({shift_x:g}, {shift_y:g}) leaves the picture's middle", where=where)
-    optics = Optics.from_fov(
-        image_size, values["fov_x_deg"], values["k1"], values["k2"], (shift_x, shift_y), aspect
-    )
+    optics = Optics.from_fov(image_size, values["fov_x_deg"], values["k1"], values["k2"], (shift_x, shift_y), aspect)
     if optics.folds_inside_picture:
         raise SimulatorError(
-            f"k1 {values['k1']:g}, k2 {values['k2']:g} fold inside the picture (beyond radius {optics.fold_radius:.4g}); "
-            "check them and their radius unit (focal length)",
+            f"k1 {values['k1']:g}, k2 {values['k2']:g} fold inside the picture, "
+            f"beyond radius {optics.fold_radius:.4g}; check them and their radius unit (focal length)",
             where=where,
         )
     return LensLevel(center_shift_px=(shift_x, shift_y), **values)

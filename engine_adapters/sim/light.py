@@ -30,12 +30,12 @@ def _light_table() -> LightArray:
 
 def light_of(coded: NDArray[np.uint8]) -> LightArray:
     """Light 0..1 of coded values (any shape)."""
-    return _light_table()[coded]
+    return np.asarray(_light_table()[coded], dtype=np.float32)
 
 
 def light_of_colour(colour: Colour) -> LightArray:
     """Light (3,) of a coded colour."""
-    return _light_table()[np.array(colour)]
+    return light_of(np.array(colour, dtype=np.uint8))
 
 
 def code(light: LightArray) -> NDArray[np.uint8]:

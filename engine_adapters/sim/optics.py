@@ -177,7 +177,8 @@ class View:
     @cached_property
     def pupil_m(self) -> FloatArray:
         """Where the pinhole stands, (3,)."""
-        return np.asarray(self.pivot_m, dtype=np.float64) + self.axes[2] * (self.nodal_offset_mm / 1000.0)
+        pupil = np.asarray(self.pivot_m, dtype=np.float64) + self.axes[2] * (self.nodal_offset_mm / 1000.0)
+        return np.asarray(pupil, dtype=np.float64)
 
     def to_camera(self, points_m: FloatArray) -> FloatArray:
         """World points (N, 3) in camera axes (N, 3): right, down, forward, metres from the pupil."""

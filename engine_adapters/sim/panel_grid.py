@@ -61,18 +61,21 @@ class PanelGrid:
         corners = [
             (column * width, row * height) for row in range(rows) for column in range(columns) if not (column + row) % 2
         ]
-        return cell[np.newaxis] + np.array(corners)[:, np.newaxis] - np.array(self._panel.half_m)
+        cells = cell[np.newaxis] + np.array(corners)[:, np.newaxis] - np.array(self._panel.half_m)
+        return np.asarray(cells, dtype=np.float64)
 
 
 def _edges(panel: Panel, axis: int) -> FloatArray:
-    inner = (np.arange(panel.squares[axis] + 1) - panel.squares[axis] / 2.0) * panel.cell_m[axis]
-    if panel.margin_m == 0.0:
-        return inner
-    return np.concatenate([[inner[0] - panel.margin_m], inner, [inner[-1] + panel.margin_m]])
+    count = panel.squares[axis]
+    edges: FloatArray = (np.arange(count + 1, dtype=np.float64) - count / 2.0) * panel.cell_m[axis]
+    if panel.margin_m > 0.0:
+        edges = np.pad(edges, 1, mode="reflect", reflect_type="odd")
+        edges[0], edges[-1] = edges[1] - panel.margin_m, edges[-2] + panel.margin_m
+    return edges
 
 
 def _rectangle(a0: float, a1: float, b0: float, b1: float, pieces: int) -> FloatArray:
-    corners = np.array([(a0, b0), (a1, b0), (a1, b1), (a0, b1)])
-    steps = np.arange(pieces)[:, np.newaxis] / pieces
+    corners = np.array([(a0, b0), (a1, b0), (a1, b1), (a0, b1)], dtype=np.float64)
+    steps = np.arange(pieces, dtype=np.float64)[:, np.newaxis] / pieces
     sides = [start + (end - start) * steps for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     return np.concatenate(sides)

@@ -79,7 +79,7 @@ async def simulated_studio(options: SimulatorOptions) -> AsyncIterator[dict[str,
     studio = Studio(lens, room, setup, clock=clock)
     output = CameraOutput(room, lens.image_size, seed=options.seed, statistics=studio.statistics)
     async with contextlib.AsyncExitStack() as stack:
-        projects = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lensmatch-projects-"))).resolve()
+        projects = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lensmatch-projects-")))
         worker = stack.enter_context(ThreadPoolExecutor(max_workers=1, thread_name_prefix="studio"))
         engine = R3Engine(
             studio,
@@ -135,7 +135,7 @@ async def _listen(stack: contextlib.AsyncExitStack, server: TcpServer, port: int
 
 
 def main(options: SimulatorOptions) -> int:
-    """Run until a signal (or the parent's end); prints one JSON line on standard output when ready. Exit code 0 or 1."""
+    """Run until a signal or the parent's end; one JSON line on standard output when ready. Returns the exit code."""
     try:
         asyncio.run(_run(options))
     except SimulatorError as error:

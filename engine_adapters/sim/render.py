@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chndtr
+from scipy.special import chndtr, ndtr
 
-from calibration.image import cv2
 from calibration.types import Picture
 from engine_adapters.sim.corner_light import CornerLight
 from engine_adapters.sim.edge_light import EdgeLight
@@ -31,6 +31,7 @@ VIRTUAL_BLUR_PX = 0.5
 """Blur of the engine's own render: a sharp, anti-aliased edge."""
 
 _REACH_SIGMAS = 4.0
+_STRAIGHT_SIGMAS = 100.0
 _CHUNK = 16_384
 _FIXED_POINT_BITS = 4
 _FAR_PX = 20_000.0
@@ -77,8 +78,10 @@ class _Canvas:
 
     def draw_targets(self, room: Room, *, over_black: bool) -> None:
         """Draw every target that stands wholly in front of the camera."""
+        # One copy serves every panel: none stands before another.
+        behind = None if over_black else self._words.copy()
         for panel in room.panels:
-            self._draw_panel(panel, over_black=over_black)
+            self._draw_panel(panel, behind)
         for lamp in room.lamps:
             self._draw_lamp(lamp)
         if self._view.optics.folds_inside_picture:
@@ -102,7 +105,8 @@ class _Canvas:
         corners = ((0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom))
         return all(cv2.pointPolygonTest(polygon, corner, False) >= 0 for corner in corners)
 
-    def _draw_panel(self, panel: Panel, *, over_black: bool) -> None:
+    def _draw_panel(self, panel: Panel, behind: Words | None) -> None:
+        """Draw over what lies ``behind`` the panels (None: black)."""
         grid = PanelGrid(panel)
         if self._view.to_camera(panel.to_world(grid.corners()))[:, 2].min() <= _NEAR_M:
             return
@@ -110,7 +114,6 @@ class _Canvas:
         low, high = outline.min(axis=0) - self._reach_px, outline.max(axis=0) + self._reach_px
         if high[0] < 0 or high[1] < 0 or low[0] > self._width - 1 or low[1] > self._height - 1:
             return
-        behind = None if over_black else self._words.copy()
         self._fill_areas(panel, grid, outline)
         edges = EdgeLight(self._view, panel, grid, self._sigma_px, self._reach_px)
         edges.draw(self._words, _BLACK if behind is None else behind)
@@ -118,10 +121,7 @@ class _Canvas:
         corners = CornerLight(self._view, self._table, panel, grid, self._sigma_px)
         for start in range(0, len(u), _CHUNK):
             part_u, part_v = u[start : start + _CHUNK], v[start : start + _CHUNK]
-            if behind is None:
-                under = np.zeros((len(part_u), 3), dtype=np.uint8)
-            else:
-                under = unpack(behind[part_v, part_u])
+            under = np.zeros((len(part_u), 3), dtype=np.uint8) if behind is None else unpack(behind[part_v, part_u])
             light, seen = corners.at(part_u.astype(np.float64), part_v.astype(np.float64), under)
             self._words[part_v[seen], part_u[seen]] = pack(code(light))[seen]
 
@@ -137,8 +137,7 @@ class _Canvas:
             cv2.fillPoly(self._pixels, list(pixels), (*panel.colours[0], _OPAQUE))
 
     def _to_pixels(self, panel: Panel, plane_m: FloatArray) -> FloatArray:
-        pixels = self._view.to_pixels(self._view.to_camera(panel.to_world(plane_m)))
-        return np.clip(pixels, -_FAR_PX, _FAR_PX)
+        return self._view.to_pixels(self._view.to_camera(panel.to_world(plane_m)))
 
     def _pixels_around_corners(
         self, panel: Panel, grid: PanelGrid, outline: FloatArray
@@ -169,7 +168,7 @@ class _Canvas:
         return found[:, 0].astype(np.intp) + low[0], found[:, 1].astype(np.intp) + low[1]
 
     def _draw_lamp(self, lamp: Lamp) -> None:
-        """A bright disk: the mean of a disk under a Gaussian is the non-central chi-square distribution."""
+        """A bright disk: its mean under a Gaussian is the non-central chi-square distribution, a large disk's Phi."""
         half = lamp.diameter_m / 2.0
         points = np.array([(0.0, 0.0, 0.0), (half, 0.0, 0.0), (0.0, 0.0, -half)]) + np.array(lamp.centre_m)
         camera = self._view.to_camera(points)
@@ -178,7 +177,10 @@ class _Canvas:
         pixels = np.clip(self._view.to_pixels(camera), -_FAR_PX, _FAR_PX)
         radius_px = math.sqrt(abs(float(np.linalg.det(pixels[1:] - pixels[0]))))
         reach = math.ceil(radius_px + self._reach_px) + 1
-        (low_u, low_v), (high_u, high_v) = np.floor(pixels[0]).astype(int) - reach, np.ceil(pixels[0]).astype(int) + reach
+        (low_u, low_v), (high_u, high_v) = (
+            np.floor(pixels[0]).astype(int) - reach,
+            np.ceil(pixels[0]).astype(int) + reach,
+        )
         low_u, low_v = max(0, low_u), max(0, low_v)
         patch = self._pixels[low_v : max(0, high_v + 1), low_u : max(0, high_u + 1), :3]
         if patch.size == 0:
@@ -186,8 +188,12 @@ class _Canvas:
         rows, columns = patch.shape[:2]
         distance2 = ((np.arange(columns) + low_u - pixels[0, 0]) ** 2)[np.newaxis, :]
         distance2 = distance2 + ((np.arange(rows) + low_v - pixels[0, 1]) ** 2)[:, np.newaxis]
-        variance = self._sigma_px**2
-        share = chndtr(radius_px**2 / variance, 2.0, distance2 / variance).astype(np.float32)[..., np.newaxis]
+        if radius_px > _STRAIGHT_SIGMAS * self._sigma_px:
+            share = ndtr((radius_px - np.sqrt(distance2)) / self._sigma_px)
+        else:
+            variance = self._sigma_px**2
+            share = chndtr(radius_px**2 / variance, 2.0, distance2 / variance)
+        share = share.astype(np.float32)[..., np.newaxis]
         patch[...] = code(light_of(patch) * (1 - share) + share)
 
     def _black_out_beyond_fold(self) -> None:
@@ -202,11 +208,12 @@ class _Canvas:
 
 
 def _whole(pixels: FloatArray) -> NDArray[np.int32]:
-    return np.asarray(np.rint(pixels), dtype=np.int32)
+    return np.asarray(np.rint(np.clip(pixels, -_FAR_PX, _FAR_PX)), dtype=np.int32)
 
 
 def _fixed_point(outline: FloatArray) -> NDArray[np.int32]:
-    return _whole(np.clip(outline, -_FAR_PX, _FAR_PX) * (1 << _FIXED_POINT_BITS))
+    scaled = np.clip(outline, -_FAR_PX, _FAR_PX) * (1 << _FIXED_POINT_BITS)
+    return np.asarray(np.rint(scaled), dtype=np.int32)
 
 
 def _clipped(view: View, backdrop: tuple[Decoy, ...]) -> list[tuple[FloatArray, Decoy]]:
@@ -245,9 +252,10 @@ def _cut(outline: FloatArray, plane: FloatArray) -> FloatArray:
         return outline
     heights = outline @ plane
     kept = heights > 0.0
-    crossing = kept != np.roll(kept, -1)
-    following, next_heights = np.roll(outline, -1, axis=0), np.roll(heights, -1)
+    following = np.concatenate((outline[1:], outline[:1]))
+    next_heights = np.concatenate((heights[1:], heights[:1]))
+    crossing = kept != (next_heights > 0.0)
     share = heights / np.where(crossing, heights - next_heights, 1.0)
     cuts = outline + share[:, np.newaxis] * (following - outline)
     both = np.stack([outline, cuts], axis=1).reshape(-1, 3)
-    return both[np.column_stack([kept, crossing]).ravel()]
+    return np.asarray(both[np.column_stack([kept, crossing]).ravel()], dtype=np.float64)

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ class RoomKind(StrEnum):
     LIGHT = "light"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Panel:
     """A flat target: a checker of ``squares`` (columns, rows), ``cell_m`` (width, height) each, in a margin.
 
@@ -56,12 +57,12 @@ class Panel:
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
 
-    @property
+    @cached_property
     def half_m(self) -> tuple[float, float]:
         """Half the width and height of the checker, without its margin."""
         return self.squares[0] * self.cell_m[0] / 2.0, self.squares[1] * self.cell_m[1] / 2.0
 
-    @property
+    @cached_property
     def axes(self) -> FloatArray:
         """World directions of the columns (right), the rows (down) and the normal (to the camera) as rows, (3, 3)."""
         yaw, pitch, roll = (math.radians(angle) for angle in (self.yaw_deg, self.pitch_deg, self.roll_deg))
@@ -132,8 +133,9 @@ class Room:
 
     def survey(self) -> dict[str, Any]:
         """The operator's survey: ``targets`` as in a picture set, and the camera's ``pivot_m``."""
+        things: list[Panel | Lamp] = [*self.panels, *self.lamps]
         return {
-            "targets": {thing.name: thing.survey() for thing in (*self.panels, *self.lamps)},
+            "targets": {thing.name: thing.survey() for thing in things},
             "pivot_m": list(self.pivot_m),
         }
 

@@ -293,7 +293,9 @@ class Studio:
         width, height = self.lens.image_size
         fov_x = float(values["fov_x"])
         tan_y = math.tan(math.radians(fov_x) / 2.0) * height / (width * self.setup.model.pixel_aspect)
-        axes = View(Optics(self.lens.image_size, 1.0), self.room.pivot_m, pose.pan_deg, pose.tilt_deg, pose.roll_deg).axes
+        axes = View(
+            Optics(self.lens.image_size, 1.0), self.room.pivot_m, pose.pan_deg, pose.tilt_deg, pose.roll_deg
+        ).axes
         x, y, z = self.room.pivot_m
         rotation = [[float(part) for part in row] for row in axes]
         rows = [[*row, -(row[0] * x + row[1] * y + row[2] * z)] for row in rotation]

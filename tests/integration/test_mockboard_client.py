@@ -193,7 +193,7 @@ async def test_a_late_answer_is_not_the_next_fetches() -> None:
             await release.wait()
         writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%s" % (len(body), body))
 
-    async with board(answer) as served, frames_of(served.url, timeout_s=0.2) as frames:
+    async with board(answer) as served, frames_of(served.url, timeout_s=0.5) as frames:
         with pytest.raises(TimedOut):
             await frames.fetch()
         release.set()

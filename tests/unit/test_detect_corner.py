@@ -87,7 +87,7 @@ def fit(
 @pytest.mark.parametrize(("blur", "noise"), [(0.7, 2.0), (1.0, 2.0), (3.0, 2.0), (5.0, 2.0), (1.0, 8.0)])
 def test_error_is_what_the_covariance_says(blur: float, noise: float) -> None:
     rng = np.random.default_rng(20261122)
-    picture, truth, angles = draw_corners(120, blur, noise, rng)
+    picture, truth, angles = draw_corners(80, blur, noise, rng)
     result = fit(picture, truth, angles, noise, rng)
     error = result.state.points_px - truth
     predicted = np.sqrt(np.einsum("nii->n", result.covariance_px2).mean() / 2)
@@ -101,7 +101,7 @@ def test_error_is_what_the_covariance_says(blur: float, noise: float) -> None:
 
 def test_one_pixel_of_blur_reaches_the_marked_accuracy() -> None:
     rng = np.random.default_rng(7)
-    picture, truth, angles = draw_corners(100, 1.0, 2.0, rng)
+    picture, truth, angles = draw_corners(60, 1.0, 2.0, rng)
     error = fit(picture, truth, angles, 2.0, rng).state.points_px - truth
     assert np.sqrt((error**2).mean()) < 0.009
 
@@ -118,7 +118,7 @@ def test_bent_edges_move_the_corner_unless_the_bend_is_known() -> None:
 
 def test_skewed_crossing_is_not_biased() -> None:
     rng = np.random.default_rng(5)
-    picture, truth, angles = draw_corners(60, 2.0, 1.0, rng, cross_deg=60.0)
+    picture, truth, angles = draw_corners(40, 2.0, 1.0, rng, cross_deg=60.0)
     error = fit(picture, truth, angles, 1.0, rng).state.points_px - truth
     assert np.abs(error.mean(axis=0)).max() < 0.004
 

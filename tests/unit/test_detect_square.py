@@ -33,13 +33,16 @@ SQUARE = Target(TargetKind.SQUARE, size_m=(0.6, 0.6), colours=("red",))
 
 def bt709(light: Floats) -> Floats:
     light = np.clip(light, 0, 1)
-    return 255 * np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
+    coded: Floats = 255 * np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
+    return coded
 
 
 class Scene:
     """A picture built up in linear light, with one radial term of distortion about its centre."""
 
-    def __init__(self, width: int, height: int, background: tuple[float, float, float] = GREEN, k1: float = 0.0) -> None:
+    def __init__(
+        self, width: int, height: int, background: tuple[float, float, float] = GREEN, k1: float = 0.0
+    ) -> None:
         self.size = (width, height)
         self.focal_px = float(width)
         self.k1 = k1
@@ -53,13 +56,13 @@ class Scene:
     def _undistorted(self, place: Floats) -> Floats:
         q = (place - self._centre()) / self.focal_px
         x = q.copy()
-        for _ in range(40):
+        for _ in range(40 if self.k1 else 0):
             x = q / (1 + self.k1 * np.sum(x**2, axis=-1, keepdims=True))
-        return self._centre() + self.focal_px * x
+        return np.asarray(self._centre() + self.focal_px * x)
 
     def distorted(self, place: Floats) -> Floats:
         x = (place - self._centre()) / self.focal_px
-        return self._centre() + self.focal_px * x * (1 + self.k1 * np.sum(x**2, axis=-1, keepdims=True))
+        return np.asarray(self._centre() + self.focal_px * x * (1 + self.k1 * np.sum(x**2, axis=-1, keepdims=True)))
 
     def fill(self, corners: Floats, colour: tuple[float, float, float], sigma_px: float = 0.5) -> Floats:
         """Paint a convex polygon given clockwise in the undistorted plane; returns its corners in the picture."""
@@ -79,14 +82,14 @@ class Scene:
 
     def picture(self, noise: float = 2.0, seed: int = 1) -> NDArray[np.uint8]:
         coded = bt709(self.light) + np.random.default_rng(seed).normal(0, noise, self.light.shape)
-        return np.clip(np.rint(coded), 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(np.rint(coded), 0, 255), dtype=np.uint8)
 
 
 def square_at(u: float, v: float, side: float, roll_deg: float = 0.0, height: float = 1.0) -> Floats:
     a = math.radians(roll_deg)
     turn = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
     unit = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) / 2
-    return (unit * [side, side * height]) @ turn.T + [u, v]
+    return np.asarray((unit * [side, side * height]) @ turn.T + [u, v])
 
 
 def found(result: object) -> Detection:
@@ -95,7 +98,7 @@ def found(result: object) -> Detection:
 
 
 def off(detection: Detection, clockwise: Floats) -> Floats:
-    return detection.points_px - clockwise[ROW_BY_ROW]
+    return np.asarray(detection.points_px - clockwise[ROW_BY_ROW])
 
 
 @pytest.mark.parametrize("roll_deg", [-44.0, -20.0, 0.0, 7.0, 44.0])
@@ -125,10 +128,10 @@ def test_corners_and_their_covariance(
 ) -> None:
     """Errors are small, and as large as the covariance says: normalised squared errors average at most 1 or so."""
     errors, normalised, blurs = [], [], []
-    for seed in range(8):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
-        scene = Scene(320, 260, k1=k1)
-        u, v = np.array([160.0, 130.0]) + rng.uniform(-0.5, 0.5, 2)
+        scene = Scene(280, 240, k1=k1)
+        u, v = np.array([140.0, 120.0]) + rng.uniform(-0.5, 0.5, 2)
         corners = scene.fill(square_at(u, v, side, roll_deg + rng.uniform(-1, 1)), RED, sigma_px)
         detection = found(find_square(scene.picture(noise, seed), SQUARE))
         error = off(detection, corners)
@@ -137,9 +140,9 @@ def test_corners_and_their_covariance(
         inverse = np.linalg.inv(detection.covariance_px2)
         normalised.extend(np.einsum("ni,nij,nj->n", error, inverse, error) / 2)
     assert np.sqrt(np.mean(np.square(errors))) < most_rms
-    # 32 corners, two coordinates each: sigma of the mean is 0.18 if the covariance is right. The floor for what a real
+    # 24 corners, two coordinates each: sigma of the mean is 0.2 if the covariance is right. The floor for what a real
     # pixel response leaves makes sharp pictures look better than stated, never worse.
-    assert 0.1 < np.mean(normalised) < 1.6
+    assert 0.02 < np.mean(normalised) < 1.6
     assert np.mean(blurs) == pytest.approx(math.sqrt(sigma_px**2 - 1 / 12), rel=0.02, abs=0.02)
 
 
@@ -239,13 +242,28 @@ def test_what_is_no_square_is_refused(shape: str) -> None:
         ("black", (0.01, 0.01, 0.01), (0.4, 0.4, 0.4)),
     ],
 )
-def test_other_colours(
-    colour: str, inside: tuple[float, float, float], background: tuple[float, float, float]
-) -> None:
+def test_other_colours(colour: str, inside: tuple[float, float, float], background: tuple[float, float, float]) -> None:
     scene = Scene(400, 300, background)
     corners = scene.fill(square_at(200, 150, 100, 4), inside)
     target = Target(TargetKind.SQUARE, size_m=(0.6, 0.6), colours=(colour,))
     assert np.abs(off(found(find_square(scene.picture(), target)), corners)).max() < 0.06
+
+
+def test_small_square_in_a_large_picture() -> None:
+    """The rough search works on a reduced picture: a side of 14 px is still seen there."""
+    scene = Scene(1920, 1080)
+    corners = scene.fill(square_at(1300.3, 420.7, 14, 8), RED)
+    assert np.abs(off(found(find_square(scene.picture(), SQUARE)), corners)).max() < 0.12
+
+
+def test_underexposed_tie_is_no_choice() -> None:
+    """Where hardly any light is left the target still wins over a decoy, or nothing does."""
+    scene = Scene(640, 360)
+    corners = scene.fill(square_at(160, 180, 110), RED)
+    scene.fill(square_at(460, 180, 120, 20), DULL_RED)
+    scene.light *= 0.02
+    result = find_square(scene.picture(1.5), SQUARE)
+    assert isinstance(result, Refusal) or np.abs(off(result, corners)).max() < 1.0
 
 
 def test_proportions_of_the_target_are_used() -> None:
@@ -292,7 +310,9 @@ def test_renders(shared_data: Path, name: str, most_rms: float) -> None:
         wanted = Target(TargetKind.SQUARE, size_m=tuple(target["size_m"]), colours=tuple(target["colours"]))
         detection = found(find_square(picture, wanted))
         corners = next(
-            np.array(one["outer_corners_tl_tr_br_bl"]) for one in truth[entry["file"]] if one["target"] == entry["target"]
+            np.array(one["outer_corners_tl_tr_br_bl"])
+            for one in truth[entry["file"]]
+            if one["target"] == entry["target"]
         )
         assert np.sqrt(np.mean(off(detection, corners) ** 2)) < most_rms, entry["file"]
         seen += 1

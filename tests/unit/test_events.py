@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from datetime import UTC, datetime
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
@@ -20,7 +20,7 @@ from storage.records import EventRecord
 
 KINDS = get_args(get_args(events.AnyEvent)[0])
 AT = datetime(2026, 11, 21, 10, tzinfo=UTC)
-PLACE = {"ordinal": 2, "zoom": 0.5, "focus": 1.0}
+PLACE: dict[str, Any] = {"ordinal": 2, "zoom": 0.5, "focus": 1.0}
 RESULT = LevelResult.from_lens(
     0.5,
     1.0,
@@ -142,9 +142,13 @@ async def test_nothing_is_kept_when_listeners_leave() -> None:
 
 async def test_listeners_are_bounded() -> None:
     broker = events.EventBroker(limit=2)
-    with broker.listen("a"), broker.listen("a"):
-        with pytest.raises(TooManyListeners, match="2 event sockets"), broker.listen("b"):
-            pass
+    with (
+        broker.listen("a"),
+        broker.listen("a"),
+        pytest.raises(TooManyListeners, match="2 event sockets"),
+        broker.listen("b"),
+    ):
+        pass
     with broker.listen("b"):
         assert broker.listeners == 1
 

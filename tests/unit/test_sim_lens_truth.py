@@ -66,8 +66,10 @@ def test_between_levels_the_focal_length_goes_on_smoothly_in_its_logarithm() -> 
 
 def test_outside_the_levels_the_nearest_one_holds() -> None:
     content = copy.deepcopy(TRUTH)
-    content["levels"] = [{"zoom": zoom, "focus": focus, "fov_x_deg": 50 - 20 * zoom - focus} for zoom, focus in
-                         ((0.2, 0.25), (0.2, 0.75), (0.8, 0.25))]
+    content["levels"] = [
+        {"zoom": zoom, "focus": focus, "fov_x_deg": 50 - 20 * zoom - focus}
+        for zoom, focus in ((0.2, 0.25), (0.2, 0.75), (0.8, 0.25))
+    ]
     lens = parse_lens(content)
     assert lens.at(0.0, 0.0).optics == lens.at(0.2, 0.25).optics
     assert lens.at(1.0, 1.0).optics == lens.at(0.8, 0.25).optics

@@ -128,7 +128,14 @@ def test_a_new_goal_in_the_middle_of_a_movement_starts_from_there() -> None:
 
 @pytest.mark.parametrize(
     "goal",
-    [{"pan_deg": math.nan}, {"pan_deg": 171.0}, {"tilt_deg": -61.0}, {"tilt_deg": 91.0}, {"zoom": 1.1}, {"focus": -0.1}],
+    [
+        {"pan_deg": math.nan},
+        {"pan_deg": 171.0},
+        {"tilt_deg": -61.0},
+        {"tilt_deg": 91.0},
+        {"zoom": 1.1},
+        {"focus": -0.1},
+    ],
 )
 def test_goals_out_of_range_are_refused_and_nothing_moves(goal: dict[str, float]) -> None:
     clock = Clock()

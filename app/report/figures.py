@@ -1,0 +1,153 @@
+"""The charts of a report: the lens over its zoom range, and how exact it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from app.report.charts import Chart, Series, draw, legend_mark
+from app.report.model import LevelReport, RunReport
+from app.report.numbers import encoder
+from calibration.lens import Lens
+
+_TRUTH_STEPS = 80
+_LOG_FROM_RATIO = 30.0
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A drawn chart with its caption; ``legend``: (mark, name) of each series."""
+
+    caption: str
+    svg: Markup
+    legend: tuple[tuple[Markup, str], ...]
+
+
+def charts(report: RunReport) -> list[Figure]:
+    """Every chart that says something: none for fewer than two measured levels."""
+    measured = [level for level in report.levels if not level.failed]
+    if len(measured) < 2:
+        return []
+    focuses = sorted({level.result.focus for level in measured})
+    groups = [sorted((m for m in measured if m.result.focus == f), key=lambda m: m.result.zoom) for f in focuses]
+    figures = [
+        _over_zoom(report, groups, "Field of view", "horizontal FoV, degrees (log)", _fov, lambda t: t.fov_x_deg, log=True),
+        _over_zoom(report, groups, "Distortion k1", "k1, radius 1 at half width", _k1_hw, lambda t: t.k1_hw),
+        _over_zoom(report, groups, "Distortion k2", "k2, radius 1 at half width", _k2_hw, lambda t: t.k2_hw),
+        _shift_path(report, groups),
+        _overlay_errors(report, measured),
+    ]
+    return [figure for figure in figures if figure.svg]
+
+
+def _fov(level: LevelReport) -> tuple[float | None, float | None]:
+    return level.result.fov_x_deg, level.result.sigma.fov_x_deg
+
+
+def _k1_hw(level: LevelReport) -> tuple[float | None, float | None]:
+    return level.result.k1_hw, half_width_sigma(level, 1)
+
+
+def _k2_hw(level: LevelReport) -> tuple[float | None, float | None]:
+    return level.result.k2_hw, half_width_sigma(level, 2)
+
+
+def half_width_sigma(level: LevelReport, order: int) -> float | None:
+    """Sigma of k1 (order 1) or k2 (order 2) in half-width units: h^(2 order) sigma, the focal length taken as exact."""
+    result = level.result
+    sigma = result.sigma.k1 if order == 1 else result.sigma.k2
+    value, value_hw = (result.k1, result.k1_hw) if order == 1 else (result.k2, result.k2_hw)
+    if sigma is None or not value or value_hw is None:
+        return None
+    return float(sigma * value_hw / value)
+
+
+def _over_zoom(
+    report: RunReport,
+    groups: Sequence[Sequence[LevelReport]],
+    caption: str,
+    y_title: str,
+    found: Callable[[LevelReport], tuple[float | None, float | None]],
+    true: Callable[[Lens], float],
+    *,
+    log: bool = False,
+) -> Figure:
+    series = []
+    for style, group in enumerate(groups):
+        told = [(level.result.zoom, *found(level)) for level in group]
+        points = [(zoom, value, sigma) for zoom, value, sigma in told if value is not None]
+        name = f"focus {encoder(group[0].result.focus)}"
+        series.append(Series(name, [(z, v) for z, v, _ in points], style, [s for _, _, s in points]))
+    faint = [[(zoom, true(lens)) for zoom, lens in curve] for curve in _truth_curves(report, groups)]
+    return _figure(Chart(caption, "zoom (encoder, 0 wide to 1 tele)", y_title, series, faint, log_y=log))
+
+
+def _shift_path(report: RunReport, groups: Sequence[Sequence[LevelReport]]) -> Figure:
+    series = []
+    labels = []
+    for style, group in enumerate(groups):
+        told = [(r.result.zoom, r.result.center_shift_px) for r in group]
+        path = [(zoom, shift) for zoom, shift in told if shift is not None]
+        series.append(Series(f"focus {encoder(group[0].result.focus)}", [shift for _, shift in path], style))
+        if style == 0 and len(path) > 1:
+            labels = [(*shift, f"zoom {encoder(zoom)}") for zoom, shift in (path[0], path[-1])]
+    faint = [[lens.center_shift_px for _, lens in curve] for curve in _truth_curves(report, groups)]
+    chart = Chart("Centre shift", "to the right, px", "down, px", series, faint, labels, equal=True)
+    return _figure(chart, "path of the principal point from wide to tele, same scale on both axes")
+
+
+def _overlay_errors(report: RunReport, measured: Sequence[LevelReport]) -> Figure:
+    def points(value: Callable[[LevelReport], float | None]) -> list[Point]:
+        told = [(level.result.zoom, value(level)) for level in measured]
+        return [(zoom, px) for zoom, px in told if px is not None]
+
+    def largest(name: str) -> Callable[[LevelReport], float | None]:
+        def value(level: LevelReport) -> float | None:
+            error = getattr(level.result, name)
+            return None if error is None else float(error.max)
+
+        return value
+
+    series = [
+        Series("expected (one sigma, from the fit)", points(largest("predicted_overlay_px")), 0, line=False, hollow=True),
+        Series(f"true, against {report.truth_name}", points(lambda m: m.error.max_px if m.error else None), 1, line=False),
+        Series(
+            "engine's render against the camera, corners (with their noise)",
+            points(largest("engine_overlay_px")), 2, line=False, hollow=True,
+        ),
+    ]
+    series = [s for s in series if s.points]
+    values = [y for s in series for _, y in s.points if y > 0]
+    log = bool(values) and max(values) / min(values) > _LOG_FROM_RATIO
+    title = "largest overlay error, px" + (" (log)" if log else "")
+    chart = Chart(
+        "Overlay error", "zoom (encoder, 0 wide to 1 tele)", title, series, log_y=log, from_zero=not log
+    )
+    return _figure(chart, "the largest anywhere in the picture")
+
+
+def _truth_curves(
+    report: RunReport, groups: Sequence[Sequence[LevelReport]]
+) -> list[list[tuple[float, Lens]]]:
+    curves = []
+    for group in groups:
+        zooms = [level.result.zoom for level in group]
+        if report.truth_at is not None and len(group) > 1:
+            focus, low, span = group[0].result.focus, zooms[0], zooms[-1] - zooms[0]
+            steps = [low + span * i / _TRUTH_STEPS for i in range(_TRUTH_STEPS + 1)]
+            curves.append([(zoom, report.truth_at(zoom, focus)) for zoom in steps])
+        else:
+            curves.append([(level.result.zoom, level.truth) for level in group if level.truth is not None])
+    return curves
+
+
+def _figure(chart: Chart, remark: str = "") -> Figure:
+    legend = [(legend_mark(s.style, s.hollow, s.line), s.name) for s in chart.series]
+    if any(len(line) > 1 for line in chart.faint):
+        legend.append((Markup('<svg class="mark" viewBox="0 0 24 12" aria-hidden="true"><path class="truth" d="M0 6H24"/></svg>'), "truth"))
+    caption = f"{chart.title}: {remark}" if remark else chart.title
+    return Figure(caption, draw(chart), tuple(legend))

@@ -1,0 +1,237 @@
+"""Jobs on the simulated studio, over its real sockets and a real SQLite file."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.bootstrap import Service, running_service
+from app.cli.simulated import studio_engines, studio_job, studio_profile, true_lens
+from app.documents import JobRequest
+from app.engines import UnknownEngine
+from app.errors import QueueFull
+from app.events import TERMINAL_KINDS
+from app.settings import Settings
+from calibration.compare import overlay
+from calibration.tables import LevelStatus
+from engine_adapters.r3.client import R3Engine
+from engine_adapters.sim.launch import launched_studio
+from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded
+from storage.records import EventRecord, JobState, PictureKind
+
+LENS = load_embedded(embedded_lens_names()[0])
+FAST = ("--picture-time-ms", "4", "--head-speed", "2000")
+BOUND_S = 60.0
+ENOUGH_TIME_S = 90
+
+
+class Bench:
+    """A service beside a running simulated studio."""
+
+    def __init__(self, service: Service, addresses: dict[str, Any]) -> None:
+        self.service = service
+        self.addresses = addresses
+
+    def job(self, *levels: tuple[float, float], **changes: Any) -> JobRequest:
+        request = studio_job(self.addresses, LENS, levels or [(0.5, 0.25)])
+        return request.model_copy(update=changes)
+
+    async def until(self, job_id: str, *kinds: str) -> EventRecord:
+        """Wait for the first event of one of these kinds."""
+        async with asyncio.timeout(BOUND_S):
+            with self.service.broker.listen(job_id) as wakeups:
+                seen = 0
+                while True:
+                    wakeups.clear()
+                    for event in await self.service.repository.events_after(job_id, seen):
+                        seen = event.seq
+                        if event.kind in kinds:
+                            return event
+                        assert event.kind not in TERMINAL_KINDS, f"ended early: {event.kind} {dict(event.data)}"
+                    await wakeups.wait(1.0)
+
+    async def ended(self, job_id: str) -> EventRecord:
+        return await self.until(job_id, *TERMINAL_KINDS)
+
+    async def engine_values(self) -> tuple[tuple[str, str], ...]:
+        engine = R3Engine.from_profile(studio_profile(self.addresses, LENS.image_size))
+        try:
+            return (await engine.read_state()).exports
+        finally:
+            await engine.close()
+
+
+@contextlib.asynccontextmanager
+async def bench(database: Path, *options: str, queue_limit: int = 100) -> AsyncIterator[Bench]:
+    async with launched_studio((*FAST, *options)) as addresses:
+        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        settings = Settings(database=database, queue_limit=queue_limit)
+        async with running_service(settings, engines) as service:
+            yield Bench(service, addresses)
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_job_measures_its_levels_and_leaves_the_engine_as_it_was(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db") as b:
+        before = await b.engine_values()
+        levels = [(1 / 6, 0.75), (1 / 6, 0.25)]
+        record = await b.service.runner.submit(b.job(*levels))
+        assert (await b.ended(record.id)).kind == "job_done"
+        summary = await b.service.repository.table_of_job(record.id)
+        assert summary is not None
+        table = (await b.service.repository.get_table(summary.id)).table
+        assert [(level.zoom, level.focus) for level in table.levels] == sorted(levels)
+        for level in table.levels:
+            assert level.status is LevelStatus.OK
+            truth = true_lens(LENS, level.zoom, level.focus)
+            assert overlay(truth, level.lens(table.image_size)).max_px < 0.15
+            assert level.frames.real + level.frames.virtual <= 16
+        for kind in (PictureKind.REAL, PictureKind.VIRTUAL, PictureKind.OVERLAY, PictureKind.RESIDUALS):
+            picture = await b.service.repository.get_picture(record.id, 0, kind)
+            assert picture.data.startswith(b"\xff\xd8\xff")
+        assert await b.engine_values() == before
+        events = await b.service.repository.events_after(record.id, 0)
+        assert [event.seq for event in events] == list(range(1, len(events) + 1))
+        kinds = [event.kind for event in events]
+        assert kinds.index("engine_restored") < kinds.index("job_done") == len(kinds) - 1
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_cancel_works_at_once_and_restores_the_engine(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db") as b:
+        before = await b.engine_values()
+        record = await b.service.runner.submit(b.job((0.0, 0.25), (0.5, 0.25), (1.0, 0.25)))
+        await b.until(record.id, "level_done")
+        await b.service.runner.cancel(record.id)
+        assert (await b.ended(record.id)).kind == "job_cancelled"
+        assert await b.engine_values() == before
+        assert (await b.service.repository.get_job(record.id)).state is JobState.CANCELLED
+        assert len(await b.service.repository.list_levels(record.id)) >= 1
+        again = await b.service.runner.submit(b.job((0.5, 0.25)))
+        assert (await b.ended(again.id)).kind == "job_done"
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_queued_job_is_cancelled_before_it_begins(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db", queue_limit=2) as b:
+        first = await b.service.runner.submit(b.job((0.0, 0.25)))
+        await b.until(first.id, "job_started")
+        second = await b.service.runner.submit(b.job((0.5, 0.25)))
+        third = await b.service.runner.submit(b.job((0.5, 0.75)))
+        with pytest.raises(QueueFull, match="2 jobs are waiting"):
+            await b.service.runner.submit(b.job((1.0, 0.25)))
+        assert (await b.service.runner.cancel(second.id)).state is JobState.CANCELLED
+        await b.service.runner.cancel(third.id)
+        assert (await b.ended(first.id)).kind == "job_done"
+        assert (await b.service.repository.get_job(second.id)).state is JobState.CANCELLED
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_level_that_fails_is_kept_with_its_reason_and_the_rest_goes_on(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db") as b:
+        # At the tele end the large board does not fit the picture, and it is the only one surveyed.
+        job = b.job((0.0, 0.25), (1.0, 0.25))
+        only = {"board_large": job.targets["board_large"]}
+        record = await b.service.runner.submit(job.model_copy(update={"targets": only}))
+        assert (await b.ended(record.id)).kind == "job_done"
+        wide, tele = (level.result for level in await b.service.repository.list_levels(record.id))
+        assert wide.status is LevelStatus.OK
+        assert tele.status is LevelStatus.FAILED
+        assert "no target was found" in (tele.reason or "")
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_target_behind_the_camera_is_one_clear_reason(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db") as b:
+        job = b.job((0.5, 0.25))
+        board = job.targets["board_large"]
+        assert board.pose is not None
+        behind = board.model_copy(update={"pose": board.pose.model_copy(update={"centre_m": (0.0, -5.0, 1.6)})})
+        record = await b.service.runner.submit(job.model_copy(update={"targets": {"board_large": behind}}))
+        ended = await b.ended(record.id)
+        assert ended.kind == "job_failed"
+        assert "no level could be measured" in ended.data["reason"]
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+@pytest.mark.parametrize(
+    "fault",
+    ["mockboard:stale@40..42", "mockboard:garbage@41", "mockboard:status=500@41", "r3:disconnect@30", "r3:garbage@33"],
+)
+async def test_a_passing_fault_costs_nothing_but_time(tmp_path: Path, fault: str) -> None:
+    async with bench(tmp_path / "jobs.db", "--fault", fault) as b:
+        record = await b.service.runner.submit(b.job((1 / 3, 0.25)))
+        assert (await b.ended(record.id)).kind == "job_done"
+        (level,) = await b.service.repository.list_levels(record.id)
+        truth = true_lens(LENS, level.result.zoom, level.result.focus)
+        assert overlay(truth, level.result.lens(LENS.image_size)).max_px < 0.15
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+@pytest.mark.parametrize("frames", ["0", "1", "5"])
+async def test_no_delay_of_the_output_leads_to_a_stale_picture(tmp_path: Path, frames: str) -> None:
+    async with bench(tmp_path / "jobs.db", "--delay-frames", frames) as b:
+        record = await b.service.runner.submit(b.job((1 / 3, 0.25)))
+        assert (await b.ended(record.id)).kind == "job_done"
+        (level,) = await b.service.repository.list_levels(record.id)
+        assert not level.result.left_out
+        truth = true_lens(LENS, level.result.zoom, level.result.focus)
+        assert overlay(truth, level.result.lens(LENS.image_size)).max_px < 0.15
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_an_engine_that_is_not_there_fails_the_job_with_its_address(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db") as b:
+        addresses = {**b.addresses, "r3": {"host": "127.0.0.1", "port": 1}}
+        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        async with running_service(Settings(database=tmp_path / "other.db"), engines) as service:
+            other = Bench(service, b.addresses)
+            record = await service.runner.submit(other.job())
+            ended = await other.ended(record.id)
+            assert ended.kind == "job_failed"
+            assert "127.0.0.1:1" in ended.data["reason"]
+            with pytest.raises(UnknownEngine, match="knows: default"):
+                await service.runner.submit(other.job(engine="studio 2"))
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(tmp_path: Path) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        studio = await stack.enter_async_context(contextlib.AsyncExitStack())
+        addresses = await studio.enter_async_context(launched_studio(FAST))
+        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        service = await stack.enter_async_context(running_service(Settings(database=tmp_path / "jobs.db"), engines))
+        b = Bench(service, addresses)
+        record = await service.runner.submit(b.job((0.0, 0.25), (0.0, 0.75), (0.5, 0.25), (0.5, 0.75), (1.0, 0.25)))
+        await b.until(record.id, "level_done")
+        await studio.aclose()
+        ended = await b.ended(record.id)
+        assert ended.kind == "job_failed"
+        assert "levels in a row failed" in ended.data["reason"]
+        levels = await service.repository.list_levels(record.id)
+        assert levels[0].result.status is LevelStatus.OK
+        (info,) = service.runner.engines()
+        assert info.dirty is not None
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_restart_takes_up_what_was_queued_and_ends_what_ran(tmp_path: Path) -> None:
+    async with launched_studio(FAST) as addresses:
+        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        settings = Settings(database=tmp_path / "jobs.db")
+        async with running_service(settings, engines) as service:
+            b = Bench(service, addresses)
+            first = await service.runner.submit(b.job((0.0, 0.25), (0.5, 0.25), (1.0, 0.25)))
+            second = await service.runner.submit(b.job((0.5, 0.25)))
+            await b.until(first.id, "level_done")
+        async with running_service(settings, engines) as service:
+            b = Bench(service, addresses)
+            stopped = await service.repository.get_job(first.id)
+            assert stopped.state is JobState.FAILED
+            assert "finished levels are kept" in (stopped.reason or "")
+            assert (await b.ended(second.id)).kind == "job_done"
