@@ -15,6 +15,7 @@ from starlette.types import Lifespan
 from app.api import errors, jobs, lenses, service, sockets
 from app.api.context import PREFIX, AppContext
 from app.api.guard import Guard
+from app.api.tail import EventTail
 from app.settings import Settings
 
 API_VERSION = "1"
@@ -37,6 +38,7 @@ def create_app(context: AppContext, running: Sequence[AbstractAsyncContextManage
 
     app = _routes(lifespan)
     app.state.context = context
+    app.state.tail = EventTail(context.repository)
     errors.install(app, context.settings.retry_after_s)
     app.add_middleware(Guard, settings=context.settings)
     return app

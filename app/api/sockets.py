@@ -1,25 +1,23 @@
 """Event sockets: the events after a given one, then the live ones; nothing lost, nothing twice.
 
-Each socket reads the store by itself, woken by the broker, so that it depends on no other. A client that does not read
-fills its own connection's buffer, then its socket is closed; it asks again for the events after the last it has seen.
+Each socket keeps its own place, woken by the broker, so that it depends on no other. A client that does not read fills
+its own connection's buffer, then its socket is closed; it asks again for the events after the last it has seen.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from fastapi import APIRouter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from app.api.context import AppContext, Context
 from app.api.errors import name_of, one_line
+from app.api.tail import EventTail, Told, dumps
 from app.errors import TooManyListeners
-from app.events import TERMINAL_KINDS, Wakeups, message
+from app.events import TERMINAL_KINDS, Wakeups
 from storage.errors import NotFound, StorageError
 from storage.records import UNFINISHED_STATES, EventRecord
 from storage.schemas import format_utc
@@ -60,57 +58,69 @@ class _Close(Exception):
         super().__init__(reason)
 
 
-@dataclass(slots=True)
-class _Cursor:
-    """How far a socket is: ``read`` gives the next events, ``place`` their numbers, ``ended`` whether none follow."""
+class _Follower:
+    """How far one socket is: behind, it reads pages from the store by itself; caught up, it shares the tail."""
 
-    after: int
-    field: str
-    read: Callable[[int], Awaitable[Sequence[EventRecord]]]
-    ended: Callable[[int], Awaitable[bool]]
+    def __init__(self, context: AppContext, tail: EventTail, job_id: str | None, after: int) -> None:
+        self.after = after
+        self.caught_up = False
+        self._repository = context.repository
+        self._batch = context.settings.event_batch
+        self._tail = tail
+        self._job_id = job_id
+        self._number = after if job_id is None else None
 
-    def place(self, record: EventRecord) -> int:
-        return record.seq if self.field == "seq" else record.number
+    @property
+    def field(self) -> str:
+        """By what a client asks for the events after one."""
+        return "number" if self._job_id is None else "seq"
+
+    async def check(self) -> None:
+        """Refuse what lies beyond the last event: it was never told, so another database must have told it."""
+        if self._job_id is not None:
+            last = (await self._repository.get_job(self._job_id)).last_seq
+            beyond = self.after > last
+        else:
+            beyond = self.after > 0 and not await self._repository.all_events_after(self.after - 1, 1)
+        if beyond:
+            raise _Close(BAD_AFTER, f"after={self.after} lies beyond the last event")
+
+    async def newer(self) -> Sequence[Told]:
+        """The next events; all there are when ``caught_up`` is true afterwards."""
+        if self.caught_up and self._number is not None:
+            told = await self._tail.after(self._job_id, self._number)
+            if told is not None:
+                return told
+        if self._job_id is None:
+            records = await self._repository.all_events_after(self.after, self._batch)
+        else:
+            records = await self._repository.events_after(self._job_id, self.after, self._batch)
+        self.caught_up = len(records) < self._batch
+        return [Told.of(record) for record in records]
+
+    def went_past(self, record: EventRecord) -> None:
+        """This event was sent."""
+        self.after = record.number if self._job_id is None else record.seq
+        self._number = record.number
+
+    async def ended(self) -> bool:
+        """Whether no event can follow: the job has ended and everything was sent."""
+        if self._job_id is None:
+            return False
+        job = await self._repository.get_job(self._job_id)
+        return job.state not in UNFINISHED_STATES and self.after >= job.last_seq
 
 
 @router.websocket("/jobs/{job_id}/events")
 async def job_events(socket: WebSocket, job_id: str, context: Context) -> None:
     """The job's events with a higher seq than ``after`` (0: all), then the live ones until the job has ended."""
-    repository, batch = context.repository, context.settings.event_batch
-
-    async def read(after: int) -> Sequence[EventRecord]:
-        return await repository.events_after(job_id, after, batch)
-
-    async def ended(after: int) -> bool:
-        job = await repository.get_job(job_id)
-        return job.state not in UNFINISHED_STATES and after >= job.last_seq
-
-    async def cursor() -> _Cursor:
-        after, job = _after(socket), await repository.get_job(job_id)
-        if after > job.last_seq:
-            raise _Close(BAD_AFTER, f"after={after} lies beyond the job's last event, {job.last_seq}")
-        return _Cursor(after, "seq", read, ended)
-
-    await _serve(socket, context, job_id, cursor)
+    await _serve(socket, context, job_id)
 
 
 @router.websocket("/events")
 async def all_events(socket: WebSocket, context: Context) -> None:
     """The events of all jobs with a higher number than ``after`` (0: all), then the live ones, without end."""
-
-    async def read(after: int) -> Sequence[EventRecord]:
-        return await context.repository.all_events_after(after, context.settings.event_batch)
-
-    async def ended(after: int) -> bool:
-        return False
-
-    async def cursor() -> _Cursor:
-        after = _after(socket)
-        if after > 0 and not await context.repository.all_events_after(after - 1, 1):
-            raise _Close(BAD_AFTER, f"after={after} lies beyond the last event")
-        return _Cursor(after, "number", read, ended)
-
-    await _serve(socket, context, None, cursor)
+    await _serve(socket, context, None)
 
 
 def _after(socket: WebSocket) -> int:
@@ -123,12 +133,10 @@ def _after(socket: WebSocket) -> int:
     return int(text)
 
 
-async def _serve(
-    socket: WebSocket, context: AppContext, job_id: str | None, cursor: Callable[[], Awaitable[_Cursor]]
-) -> None:
+async def _serve(socket: WebSocket, context: AppContext, job_id: str | None) -> None:
     await socket.accept()
     async with asyncio.TaskGroup() as tasks:
-        sending = tasks.create_task(_until_closed(socket, context, job_id, cursor))
+        sending = tasks.create_task(_until_closed(socket, context, job_id))
         leaving = tasks.create_task(_until_gone(socket))
         await asyncio.wait((sending, leaving), return_when=asyncio.FIRST_COMPLETED)
         sending.cancel()
@@ -143,13 +151,14 @@ async def _until_gone(socket: WebSocket) -> None:
         pass
 
 
-async def _until_closed(
-    socket: WebSocket, context: AppContext, job_id: str | None, cursor: Callable[[], Awaitable[_Cursor]]
-) -> _Close:
+async def _until_closed(socket: WebSocket, context: AppContext, job_id: str | None) -> _Close:
     """Send until there is a reason to close."""
+    tail: EventTail = socket.app.state.tail
     try:
         with context.broker.listen(job_id) as wakeups:
-            await _send_events(socket, context, await cursor(), wakeups)
+            follower = _Follower(context, tail, job_id, _after(socket))
+            await follower.check()
+            await _send_events(socket, context, follower, wakeups)
         return _Close(ENDED, "the job has ended")
     except _Close as close:
         return close
@@ -165,34 +174,35 @@ async def _until_closed(
     except Exception:
         log.exception("event socket")
         return _Close(INTERNAL, CLOSE_CODES[INTERNAL])
+    finally:
+        if context.broker.listeners == 0:
+            tail.forget()
 
 
-async def _send_events(socket: WebSocket, context: AppContext, cursor: _Cursor, wakeups: Wakeups) -> None:
+async def _send_events(socket: WebSocket, context: AppContext, follower: _Follower, wakeups: Wakeups) -> None:
     """Send events until none can follow."""
     settings = context.settings
-    if await cursor.ended(cursor.after):
+    if await follower.ended():
         return
     while True:
         # Cleared before reading: whatever is committed after the read wakes the wait below at once.
         wakeups.clear()
-        records = await cursor.read(cursor.after)
         over = False
-        for record in records:
-            await _send(socket, message(record), settings.send_timeout_s)
-            cursor.after = cursor.place(record)
-            over = over or record.kind in TERMINAL_KINDS
-        if over and await cursor.ended(cursor.after):
+        for told in await follower.newer():
+            await _send(socket, told.text, settings.send_timeout_s)
+            follower.went_past(told.record)
+            over = over or told.record.kind in TERMINAL_KINDS
+        if over and await follower.ended():
             return
-        if len(records) >= settings.event_batch or await wakeups.wait(settings.heartbeat_s):
+        if not follower.caught_up or await wakeups.wait(settings.heartbeat_s):
             continue
-        if await cursor.ended(cursor.after):
+        if await follower.ended():
             return
-        heartbeat = {"kind": "heartbeat", "at": format_utc(context.now()), cursor.field: cursor.after}
-        await _send(socket, heartbeat, settings.send_timeout_s)
+        heartbeat = {"kind": "heartbeat", "at": format_utc(context.now()), follower.field: follower.after}
+        await _send(socket, dumps(heartbeat), settings.send_timeout_s)
 
 
-async def _send(socket: WebSocket, document: Mapping[str, Any], bound_s: float) -> None:
-    text = json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+async def _send(socket: WebSocket, text: str, bound_s: float) -> None:
     try:
         async with asyncio.timeout(bound_s):
             await socket.send_text(text)

@@ -1,19 +1,22 @@
 """What a person or a script sees: progress and messages on standard error, results on standard output, exit codes.
 
-0: done. 1: the work failed, with the reason in one line. 2: wrong usage.
+0: done. 1: the work failed, with the reason in one line. 2: wrong usage, which is what the command line alone tells;
+a file or an engine that is not there is work that failed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from app.documents import DocumentError
@@ -26,10 +29,13 @@ from storage.errors import StorageError
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 
-KNOWN_ERRORS = (AdapterError, CalibrationError, DocumentError, EngineError, ServiceError, StorageError, OSError)
+KNOWN_ERRORS = (AdapterError, CalibrationError, DocumentError, EngineError, ServiceError, StorageError)
 
 messages = Console(stderr=True, highlight=False, soft_wrap=True)
 results = Console(highlight=False, soft_wrap=True)
+
+Show = Callable[[float, str], None]
+"""Told how far the work is (0..1) and what is being done."""
 
 
 class WorkFailed(Exception):
@@ -41,35 +47,54 @@ def reported_errors() -> Iterator[None]:
     """Turn expected errors into one line on standard error and the right exit code."""
     try:
         yield
-    except DocumentError as error:
-        fail(str(error), EXIT_FAILED)
-    except KNOWN_ERRORS as error:
+    except (*KNOWN_ERRORS, WorkFailed) as error:
         fail(str(error) or type(error).__name__, EXIT_FAILED)
-    except WorkFailed as error:
-        fail(str(error), EXIT_FAILED)
+    except OSError as error:
+        fail(os_reason(error), EXIT_FAILED)
     except KeyboardInterrupt:
         fail("interrupted; what was finished is kept", EXIT_FAILED)
 
 
-def fail(message: str, code: int) -> None:
+def os_reason(error: OSError) -> str:
+    """The file and what the system says of it, without its error number."""
+    reason = error.strerror or str(error) or type(error).__name__
+    return f"{error.filename}: {reason}" if error.filename else reason
+
+
+def fail(message: str, code: int) -> NoReturn:
     """One line on standard error, then exit."""
-    messages.print(f"[bold red]error:[/] {_plain(message)}")
+    messages.print(f"[bold red]error:[/] {_one_line(message)}")
     raise typer.Exit(code)
 
 
-def wrong_usage(message: str) -> None:
+def wrong_usage(message: str) -> NoReturn:
     """Say what is wrong with the command line and exit with 2."""
     fail(message, EXIT_USAGE)
 
 
 def say(message: str) -> None:
     """A line for a person."""
-    messages.print(_plain(message))
+    messages.print(escape(message))
 
 
 def print_json(document: Any) -> None:
     """One JSON document on standard output; NaN and infinity, which JSON has not, are an error of ours."""
     sys.stdout.write(json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    sys.stdout.flush()
+
+
+def check_out(*paths: Path | None) -> None:
+    """Refuse, before any work is done, a file that could not be written at its end. Raises :class:`WorkFailed`."""
+    for path in paths:
+        if path is None:
+            continue
+        folder = path.parent
+        if path.is_dir():
+            raise WorkFailed(f"{path}: is a folder; give the name of a file in it")
+        if not folder.is_dir():
+            raise WorkFailed(f"{path}: cannot be written, there is no folder {folder}; make it first")
+        if not os.access(folder, os.W_OK):
+            raise WorkFailed(f"{path}: cannot be written, the folder {folder} does not allow it; choose another")
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -80,11 +105,29 @@ def write_file(path: Path, data: bytes) -> None:
         beside.write_bytes(data)
         beside.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # never instead of the error that led here
+            beside.unlink(missing_ok=True)
+
+
+def read_file(path: Path, limit_bytes: int) -> bytes:
+    """A whole file. Raises :class:`app.documents.DocumentError` in one line; nothing larger than the limit is read."""
+    try:
+        if path.is_dir():
+            raise DocumentError(f"{path}: is a folder, not a file")
+        with path.open("rb") as file:
+            data = file.read(limit_bytes + 1)
+    except FileNotFoundError as error:
+        raise DocumentError(f"{path}: no such file") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise DocumentError(f"{path}: cannot be read ({reason or error})") from error
+    if len(data) > limit_bytes:
+        raise DocumentError(f"{path}: larger than {limit_bytes // 2**20} MiB; this is another kind of file")
+    return data
 
 
 @contextlib.contextmanager
-def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
+def progress_bar(title: str) -> Iterator[Show]:
     """A bar on standard error; the callable takes the share done (0..1) and what is being done."""
     columns = (
         TextColumn("[bold]{task.description}"),
@@ -97,11 +140,26 @@ def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
         task = progress.add_task(title, total=1.0, doing="")
 
         def show(share: float, doing: str) -> None:
-            progress.update(task, completed=share, doing=_plain(doing))
+            progress.update(task, completed=share, doing=escape(doing))
 
         yield show
 
 
-def _plain(text: str) -> str:
-    """Text with rich's markup signs made plain."""
-    return text.replace("[", "\\[")
+@contextlib.contextmanager
+def progress_lines(title: str) -> Iterator[Show]:
+    """Progress as lines, one for each new thing that is done: where a person types in the same terminal, a bar that
+    redraws itself would garble what they type."""
+    last = ""
+
+    def show(share: float, doing: str) -> None:
+        nonlocal last
+        if doing != last:
+            last = doing
+            messages.print(f"[dim]{escape(title)} {share:4.0%}  {escape(doing)}[/]")
+
+    yield show
+
+
+def _one_line(text: str) -> str:
+    """Text with rich's markup signs made plain, on one line."""
+    return escape(" ".join(text.split()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -95,6 +96,7 @@ def demo(
             table=job.table,
             levels=[LevelReport(j.result, j.truth, j.error, job.pictures.get(_key(j.result), {})) for j in judged],
             facts=_facts(use, seconds),
+            truth_at=partial(true_lens, truth),
         )
         write_report(out / "report.html", report)
         if as_json:

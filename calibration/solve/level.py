@@ -38,6 +38,10 @@ _OUTLIER_CHI2 = 25.0
 _VIEW_OUTLIERS = 0.3
 # A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
 _FLOOR_ROUNDS = 6
+_NODAL_SIGNIFICANT = 5.0
+_NODAL_MISFIT = 1.25
+# Sigmas by which the pictures must contradict the nodal offset that was given, and how much larger it must make the
+# residuals, before theirs is used instead: small errors common to all pictures (a survey) move it by many sigmas, too.
 _UNTOLD = 0.3
 # A quantity whose sigma is above this share of its prior's says no more than the prior.
 
@@ -65,7 +69,9 @@ class LevelFit:
     ``outliers``: (picture, point number, distance px); ``dropped``: pictures left out with their reasons.
     ``poses``: camera from target (R, t in metres) of each free picture, by name. ``untold`` names the quantities
     (``k1``, ``k2``, ``center_shift_px``) that the pictures do not show: they are held at 0 in ``lens``, while
-    ``covariance`` is still that of the fit with all of them free.
+    ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
+    pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
+    stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
     """
 
     lens: Lens
@@ -80,6 +86,9 @@ class LevelFit:
     poses: dict[str, tuple[FloatArray, FloatArray]]
     iterations: int
     untold: tuple[str, ...] = ()
+    sigma_nodal_mm: float | None = None
+    nodal_told: bool = False
+    nodal_seen_mm: tuple[float, float] | None = None
 
     @property
     def sigma(self) -> FloatArray:
@@ -124,11 +133,23 @@ def solve_level(
         dropped.append((kept[bad[0]].name, reason))
         del kept[bad[0]]
     fit = fitted.result(tuple(dropped))
-    untold = _untold(fit)
-    if untold:
-        held = _Fit(kept, fit.lens, fitted.free_poses(), held=untold)
-        held.run()
-        fit = replace(held.result(tuple(dropped)), covariance=fit.covariance, untold=untold)
+    seen = None if fit.sigma_nodal_mm is None else (fit.lens.nodal_offset_mm, fit.sigma_nodal_mm)
+    nodal_told = False
+    if seen is not None:
+        given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
+        as_given = _Fit(kept, given, fitted.free_poses(), held=("nodal_offset_mm",))
+        nodal_told = abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1] and as_given.contradicted_by(fitted)
+        if not nodal_told:
+            # What contradicts nothing stays as given: left free, it would only take exactness from the field of view.
+            as_given.run()
+            fitted, fit = as_given, as_given.result(tuple(dropped))
+    held = _untold(fit)
+    if held:
+        kept_nodal = () if nodal_told else ("nodal_offset_mm",)
+        again = _Fit(kept, fit.lens, fitted.free_poses(), held=(*held, *kept_nodal))
+        again.run()
+        fit = replace(again.result(tuple(dropped)), covariance=fit.covariance, sigma_nodal_mm=fit.sigma_nodal_mm)
+    fit = replace(fit, untold=held, nodal_told=nodal_told, nodal_seen_mm=seen)
     fit.lens.require_unfolded()
     return fit
 
@@ -232,6 +253,19 @@ class _Fit:
         self.floor_px = self._floor_for_chi2()
         self.iterate(robust=False)
 
+    def contradicted_by(self, other: _Fit) -> bool:
+        """Whether this fit, with the points and the floor of ``other``, leaves clearly larger residuals than it."""
+        self.used, self.floor_px = other.used.copy(), other.floor_px
+        try:
+            self.iterate(robust=False)
+        except (NotConverged, NotEnoughData):
+            return True
+        mine, theirs = (
+            np.sqrt(np.mean(f.problem.evaluate(f.state, jacobian=False).residual_px[other.used] ** 2))
+            for f in (self, other)
+        )
+        return bool(mine > _NODAL_MISFIT * theirs)
+
     def iterate(self, *, robust: bool) -> None:
         """Gauss-Newton with Levenberg-Marquardt damping until no point moves; raises NotConverged."""
         damping = 1e-4
@@ -302,9 +336,8 @@ class _Fit:
 
     def _degrees_of_freedom(self) -> int:
         # Unknowns with a prior bring one observation each, so they take nothing from the points.
-        with_prior = self.problem.evaluate(self.state, jacobian=False).prior_residual.size - (
-            4 if self.problem.lens_free else 0
-        )
+        priors = self.problem.evaluate(self.state, jacobian=False).prior_residual.size
+        with_prior = priors - self.problem.weak_priors
         return max(2 * int(self.used.sum()) - (self.problem.count - with_prior), 1)
 
     def _robust_floor(self, residual: FloatArray) -> float:
@@ -369,6 +402,7 @@ class _Fit:
         lens = self.state.lens
         inverse = np.asarray(np.linalg.pinv(matrix, hermitian=True), dtype=np.float64)
         covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
+        column = self.problem.nodal_column
         residual = evaluation.residual_px
         whitened = (whiten @ residual[..., None])[..., 0]
         views, outliers = [], []
@@ -404,6 +438,7 @@ class _Fit:
             dropped=dropped,
             poses={self.problem.views[i].name: (p.R_ct, p.t_ct_m) for i, p in self.state.free.items()},
             iterations=self.iterations,
+            sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
         )
 
 

@@ -15,9 +15,7 @@ from calibration.types import FloatArray
 USABLE_OVERLAY_PX = 1.0
 """Expected overlay error above which a level is called degraded: a shift that a viewer begins to see."""
 
-NODAL_NOT_MEASURED = (
-    "not measured: the pictures do not show targets at two distances; the pivot is taken as the entrance pupil"
-)
+NODAL_NOT_MEASURED = "not measured: that takes pictures from known head angles of a surveyed target"
 
 
 def pixel_error(residuals: Sequence[FloatArray]) -> PixelError | None:
@@ -38,15 +36,18 @@ def level_result(
     engine_overlay_px: PixelError | None = None,
     engine_reason: str = "no engine took part",
     left_out: Sequence[LeftOut] = (),
-    nodal_known: bool = False,
 ) -> LevelResult:
-    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it;
-    ``nodal_known``: the nodal offset was given from outside and stands in the lens, else it is not told."""
+    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it."""
     expected = predicted_overlay(fit.lens, fit.covariance)
     held = pixel_error(list(held_out.values()))
     reasons = {name: "the pictures do not show it; taken as 0" for name in fit.untold}
-    if not nodal_known:
+    if fit.nodal_seen_mm is None:
         reasons["nodal_offset_mm"] = NODAL_NOT_MEASURED
+    elif not fit.nodal_told:
+        reasons["nodal_offset_mm"] = (
+            f"not told apart from {fit.lens.nodal_offset_mm:g} mm, which is taken: the pictures alone say "
+            f"{fit.nodal_seen_mm[0]:.1f} +- {fit.nodal_seen_mm[1]:.1f} mm"
+        )
     if held is None:
         reasons["held_out_px"] = "no picture could be spared from the fit"
     if engine_overlay_px is None:
@@ -66,6 +67,7 @@ def level_result(
             k1=None if "k1" in fit.untold else float(sigma[1]),
             k2=None if "k2" in fit.untold else float(sigma[2]),
             center_shift_px=None if "center_shift_px" in fit.untold else (float(sigma[3]), float(sigma[4])),
+            nodal_offset_mm=None if "nodal_offset_mm" in reasons else fit.sigma_nodal_mm,
         ),
         residual_px=PixelError(fit.rms_px, fit.max_px),
         held_out_px=held,

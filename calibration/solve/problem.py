@@ -19,12 +19,15 @@ from calibration.lens import Lens
 from calibration.types import CameraPose, Detection, FloatArray, IntArray, Target
 
 LENS_COUNT = 5
+_PER_MM = np.array([[0.0], [0.0], [-0.001]])
+# d(points in camera axes, m) / d(nodal offset, mm): the pupil moves forward along the optical axis.
 PRIOR_K1_HW = 0.5
 PRIOR_K2_HW = 0.3
 PRIOR_SHIFT_OF_WIDTH = 0.1
+PRIOR_NODAL_MM = 500.0
 _HELD = 1e-9
-# Wider than any lens that makes pictures (a 50 % bend at the edge); they only keep a quantity finite that the
-# pictures do not show, and such a quantity is then reported as not told.
+# Wider than any lens that makes pictures (a 50 % bend at the edge, a pupil half a metre off the pivot); they only keep
+# a quantity finite that the pictures do not show, and such a quantity is then reported as not told.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +138,8 @@ class Problem:
     """A level's views with their unknowns.
 
     ``lens_free`` False keeps the lens as it is (only poses move); ``held`` names lens quantities (``k1``, ``k2``,
-    ``center_shift_px``) to be kept at 0.
+    ``center_shift_px``) to be kept at 0, or ``nodal_offset_mm`` to be kept as it is. The nodal offset is an unknown
+    wherever posed pictures could tell it: taken as known, its error would hide in the field of view.
     """
 
     def __init__(
@@ -158,6 +162,10 @@ class Problem:
         self.lens_free = lens_free
         self.state = State(lens)
         self.count = LENS_COUNT if lens_free else 0
+        self.nodal_prior_mm = lens.nodal_offset_mm
+        posed = sum(not view.free for view in self.views)
+        self.nodal_free = lens_free and posed >= 2 and "nodal_offset_mm" not in held
+        self.nodal_column = self._take(1) if self.nodal_free else -1
         for index, view in enumerate(self.views):
             self._add_unknowns(index, view, free_poses)
         self.points_m: list[FloatArray] = []
@@ -195,7 +203,7 @@ class Problem:
             self.state.target_turns[view.target_name] = _Turn(self._take(3), R_wt, math.radians(pose.sigma_deg), R_wt)
 
     def camera_points(self, state: State, index: int) -> tuple[FloatArray, list[tuple[int, FloatArray]]]:
-        """One view's points in camera axes (n, 3), and d(points)/d(unknowns): (first column, (n, 3, 3)) each."""
+        """One view's points in camera axes (n, 3), and d(points)/d(unknowns): (first column, (n, 3, columns)) each."""
         view, q = self.views[index], self.points_m[index]
         if index in state.free:
             pose = state.free[index]
@@ -206,6 +214,8 @@ class Problem:
         if camera is None or target is None:
             raise RuntimeError("a view without a free pose has both poses")  # set up so in _add_unknowns
         blocks: list[tuple[int, FloatArray]] = []
+        if self.nodal_free:
+            blocks.append((self.nodal_column, np.broadcast_to(_PER_MM, (len(q), 3, 1))))
         turn = state.cameras.get(index)
         R_wc = turn.value if turn else camera_rotation(camera.pan_deg, camera.tilt_deg, camera.roll_deg)
         pivot = state.pivots.get((*camera.pivot_m, camera.sigma_m))
@@ -272,7 +282,7 @@ class Problem:
         d_ray[:, :, 2] = -rays / z[:, None]
         per_point = lens.jacobian_rays(rays) @ d_ray
         for rows, start, block in pose_parts:
-            J[rows, :, start : start + 3] += per_point[rows] @ block
+            J[rows, :, start : start + block.shape[-1]] += per_point[rows] @ block
 
     def _priors(self, state: State) -> tuple[FloatArray, FloatArray]:
         residual: list[float] = []
@@ -282,6 +292,9 @@ class Problem:
             for column, (value, sigma) in enumerate(zip(values, self._prior_sigmas, strict=True), start=1):
                 residual.append(value / sigma)
                 columns.append((column, 1 / sigma))
+        if self.nodal_free:
+            residual.append((state.lens.nodal_offset_mm - self.nodal_prior_mm) / PRIOR_NODAL_MM)
+            columns.append((self.nodal_column, 1 / PRIOR_NODAL_MM))
         for place in (*state.pivots.values(), *state.target_places.values()):
             residual += list((place.value_m - place.prior_m) / place.sigma_m)
             columns += [(place.start + i, 1 / place.sigma_m) for i in range(3)]
@@ -298,6 +311,11 @@ class Problem:
             jacobian[rows, turn.start : turn.start + 3] = (np.eye(3) + k / 2 + k @ k / 12) / turn.sigma_rad
         return np.asarray(residual), jacobian
 
+    @property
+    def weak_priors(self) -> int:
+        """How many priors say nothing a picture would not overrule: those of the lens itself."""
+        return (4 if self.lens_free else 0) + (1 if self.nodal_free else 0)
+
     def stepped(self, state: State, step: FloatArray) -> State:
         """``state`` moved by ``step`` (P,)."""
         new = state.copy()
@@ -305,7 +323,8 @@ class Problem:
             lens = state.lens
             f_px = lens.f_px * math.exp(float(np.clip(step[0], -0.7, 0.7)))
             shift = (lens.center_shift_px[0] + float(step[3]), lens.center_shift_px[1] + float(step[4]))
-            base = Lens(lens.image_size, f_px, 0.0, 0.0, shift, lens.pixel_aspect, lens.nodal_offset_mm)
+            nodal_mm = lens.nodal_offset_mm + (float(step[self.nodal_column]) if self.nodal_free else 0.0)
+            base = Lens(lens.image_size, f_px, 0.0, 0.0, shift, lens.pixel_aspect, nodal_mm)
             new.lens = base.with_hw(f_px, lens.k1_hw + float(step[1]), lens.k2_hw + float(step[2]))
         for place in (*new.pivots.values(), *new.target_places.values()):
             place.value_m = place.value_m + step[place.start : place.start + 3]

@@ -94,16 +94,15 @@ class _Canvas:
         fills = [number for number, (outline, _) in enumerate(visible) if self._fills_picture(outline)]
         for outline, decoy in visible[fills[-1] if fills else 0 :]:
             line = cv2.LINE_AA if decoy.smooth else cv2.LINE_8
-            cv2.fillPoly(self._pixels, [_fixed_point(outline)], (*decoy.colour, _OPAQUE), line, _FIXED_POINT_BITS)
+            cv2.fillPoly(self._pixels, [outline], (*decoy.colour, _OPAQUE), line, _FIXED_POINT_BITS)
 
-    def _fills_picture(self, outline: FloatArray) -> bool:
-        right, bottom = self._width - 1.0, self._height - 1.0
-        low, high = outline.min(axis=0), outline.max(axis=0)
-        if low[0] > 0 or low[1] > 0 or high[0] < right or high[1] < bottom:
+    def _fills_picture(self, outline: NDArray[np.int32]) -> bool:
+        right, bottom = ((side - 1) << _FIXED_POINT_BITS for side in (self._width, self._height))
+        left_most, top_most, wide, high = cv2.boundingRect(outline)
+        if left_most > 0 or top_most > 0 or left_most + wide <= right or top_most + high <= bottom:
             return False
-        polygon = outline.astype(np.float32)
         corners = ((0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom))
-        return all(cv2.pointPolygonTest(polygon, corner, False) >= 0 for corner in corners)
+        return all(cv2.pointPolygonTest(outline, corner, False) >= 0 for corner in corners)
 
     def _draw_panel(self, panel: Panel, behind: Words | None) -> None:
         """Draw over what lies ``behind`` the panels (None: black)."""
@@ -216,29 +215,28 @@ def _fixed_point(outline: FloatArray) -> NDArray[np.int32]:
     return np.asarray(np.rint(scaled), dtype=np.int32)
 
 
-def _clipped(view: View, backdrop: tuple[Decoy, ...]) -> list[tuple[FloatArray, Decoy]]:
-    """The outlines in pixels, cut a little outside the picture (so that nothing behind the camera is projected)."""
+def _clipped(view: View, backdrop: tuple[Decoy, ...]) -> list[tuple[NDArray[np.int32], Decoy]]:
+    """The outlines in fixed-point pixels, cut a little outside the picture (so that nothing behind the camera is projected)."""
     if not backdrop:
         return []
     points = view.to_camera(np.concatenate([decoy.outline_m for decoy in backdrop]))
     # A point is kept while both |x| and |y| stay under ``wide`` times its depth: four planes through the pupil.
-    wide = 1.4 * view.picture_radius
+    wide = 2.0 * view.picture_radius
     planes = np.array([(1.0, 0.0, wide), (-1.0, 0.0, wide), (0.0, 1.0, wide), (0.0, -1.0, wide)])
     inside = points @ planes.T
     ends = np.cumsum([len(decoy.outline_m) for decoy in backdrop])
+    begins = np.concatenate([[0], ends[:-1]])
+    lowest, highest = (pick.reduceat(inside, begins, axis=0) for pick in (np.minimum, np.maximum))
     kept = []
-    for decoy, end in zip(backdrop, ends, strict=True):
-        part = slice(end - len(decoy.outline_m), end)
-        outline, heights = points[part], inside[part]
-        if (heights.max(axis=0) <= 0.0).any():
-            continue
-        for plane in planes[heights.min(axis=0) < 0.0]:
+    for number in np.flatnonzero((highest > 0.0).all(axis=1)):
+        outline = points[begins[number] : ends[number]]
+        for plane in planes[lowest[number] < 0.0]:
             outline = _cut(outline, plane)
         if len(outline) >= 3:
-            kept.append((outline, decoy))
+            kept.append((outline, backdrop[number]))
     if not kept:
         return []
-    pixels = view.to_pixels(np.concatenate([outline for outline, _ in kept]))
+    pixels = _fixed_point(view.to_pixels(np.concatenate([outline for outline, _ in kept])))
     starts = np.cumsum([0, *(len(outline) for outline, _ in kept)])
     return [(pixels[starts[i] : starts[i + 1]], decoy) for i, (_, decoy) in enumerate(kept)]
 

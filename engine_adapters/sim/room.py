@@ -188,7 +188,7 @@ def _shell() -> Iterator[Decoy]:
 
 def _green_wall() -> Iterator[Decoy]:
     """A chroma wall, brighter where the key light falls: rings of one shade each, from the dark rim inwards."""
-    y, rings, points = 6.0, 22, 40
+    y, rings, points = 6.0, 16, 36
     left, right, top = -2.9, 3.7, 3.6
     angles = np.linspace(0.0, 2.0 * math.pi, points, endpoint=False)
     yield _flat([(left, y, 0.0), (right, y, 0.0), (right, y, top), (left, y, top)], _shaded(_WALL, _DIM))

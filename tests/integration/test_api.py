@@ -552,6 +552,30 @@ async def test_trouble_is_logged_once(
     ]
 
 
+HOSTILE = [
+    *("..", "%2e%2e", "%00", "%2f..%2f", "null", "'; DROP TABLE jobs; --", "<script>alert(1)</script>", "0" * 5000),
+    *("\u202e", "%ff%fe", "-1", "1e999", "NaN", "[]", "{}", "C:\\x", "CON", "\\\\host\\share", "%0d%0aX: y"),
+]
+
+
+async def test_no_path_or_query_makes_the_service_fail(
+    client: httpx.AsyncClient, repository: Repository, context: AppContext
+) -> None:
+    await stored_job(repository)
+    for path, methods in create_app(context).openapi()["paths"].items():
+        queries = [one["name"] for one in methods.get("get", {}).get("parameters", ()) if one["in"] == "query"]
+        for text in HOSTILE:
+            asked = path
+            for name in ("job_id", "zoom", "focus", "lens_id", "table_id"):
+                asked = asked.replace("{" + name + "}", text)
+            for method in methods:
+                answer = await client.request(method, asked, params=dict.fromkeys(queries, text))
+                assert answer.status_code < 500, f"{method} {asked}: {answer.text}"
+                if answer.status_code >= 400:
+                    assert answer.headers["content-type"] == "application/problem+json"
+                assert "x" not in answer.headers
+
+
 # Foreign pages
 
 FOREIGN_HOSTS = [

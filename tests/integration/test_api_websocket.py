@@ -261,6 +261,32 @@ async def test_a_client_that_does_not_read_holds_up_nobody(tmp_path: Path) -> No
                 assert seqs(await reading) == list(range(1, 104))
 
 
+async def test_many_sockets_do_not_read_the_store_many_times(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads = 0
+    for name in ("events_after", "all_events_after"):
+        plain = getattr(Repository, name)
+
+        async def counted(*given: Any, plain: Any = plain) -> Any:
+            nonlocal reads
+            reads += 1
+            return await plain(*given)
+
+        monkeypatch.setattr(Repository, name, counted)
+    job = await studio.job()
+    await studio.start(job)
+    async with contextlib.AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(studio.connect(f"/jobs/{job}/events")) for _ in range(20)]
+        for client in clients:
+            await received(client, lambda event: event["seq"] == 2)
+        before = reads
+        for _ in range(10):
+            await studio.note(job)
+        await studio.end(job)
+        for client in clients:
+            assert seqs(await received(client)) == list(range(3, 14))
+    assert reads - before <= 3 * 11
+
+
 async def test_sockets_are_bounded(tmp_path: Path) -> None:
     async with serving(tmp_path, event_listeners=2) as studio:
         job = await studio.job()

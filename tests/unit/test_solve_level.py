@@ -133,11 +133,12 @@ def test_every_focal_length_converges_from_nothing(fov: float) -> None:
     straight = Lens.from_fov(SIZE, fov, center_shift_px=(-4, 6))
     lens = straight.with_hw(straight.f_px, -0.05, 0.01)
     scale = np.tan(np.radians(fov / 2)) / np.tan(np.radians(58 / 2))
+    rng = np.random.default_rng(6)
     target = replace(BOARD, square_m=0.1 * scale)
     views = []
     for pan, tilt in ANGLES:
         pose = CameraPose((0.0, 0.0, 1.6), pan * scale, tilt * scale)
-        seen = observe(lens, pose, target, np.random.default_rng(6), 0.02)
+        seen = observe(lens, pose, target, rng, 0.02)
         if isinstance(seen, Detection):
             views.append(View(f"{pan} {tilt}", "board", target, seen, pose))
     assert len(views) >= 5
@@ -203,7 +204,9 @@ def test_bad_input_is_one_clear_error() -> None:
     behind = replace(BOARD, pose=TargetPose((0.0, -5.0, 1.6)))
     with pytest.raises(NotEnoughData, match="behind the camera"):
         solve_level([replace(v, target=behind) for v in views], SIZE)
-    flipped = [replace(v, camera_pose=CameraPose((0, 0, 1.6), pan_deg=-a[0])) for v, a in zip(views, ANGLES, strict=True)]
+    flipped = [
+        replace(v, camera_pose=CameraPose((0, 0, 1.6), pan_deg=-a[0])) for v, a in zip(views, ANGLES, strict=True)
+    ]
     with pytest.raises((NotEnoughData, FoldedLens)):
         solve_level([v for v, a in zip(flipped, ANGLES, strict=True) if a[0] and not a[1]], SIZE)
     hand = hand_held_views(Lens((1280, 720), 1168.0), np.random.default_rng(12), 1)
@@ -230,3 +233,16 @@ def test_residual_of_a_picture_not_in_the_fit() -> None:
     residual = residual_of(views[0], WIDE)
     assert residual is not None
     assert float(np.sqrt(np.mean(residual**2))) == pytest.approx(0.02, rel=0.3)
+
+
+def test_a_pupil_off_the_pivot_is_measured_where_the_pictures_contradict_the_given_one() -> None:
+    lens = replace(WIDE, nodal_offset_mm=120.0)
+    fit = solve_level(posed_views(lens, np.random.default_rng(15)), SIZE)
+    assert fit.nodal_told
+    assert fit.sigma_nodal_mm is not None
+    assert abs(fit.lens.nodal_offset_mm - 120.0) < 4 * fit.sigma_nodal_mm
+    assert overlay(lens, fit.lens).max_px < 4 * predicted_overlay(fit.lens, fit.covariance).max_px
+    given = solve_level(posed_views(lens, np.random.default_rng(15)), SIZE, nodal_offset_mm=120.0)
+    assert not given.nodal_told
+    assert given.lens.nodal_offset_mm == 120.0
+    assert predicted_overlay(given.lens, given.covariance).max_px < predicted_overlay(fit.lens, fit.covariance).max_px

@@ -1,0 +1,67 @@
+"""``lensmatch bench``: accuracy and speed, side by side with their baselines."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from app.cli.console import check_out, print_json, progress_bar, reported_errors, results, say, write_file, wrong_usage
+from app.cli.tables import plain_table
+from benchmarks.registry import BENCHMARKS, Benchmark, Row, machine
+
+
+def bench(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help=f"{', '.join(BENCHMARKS)}; without one: all")
+    ] = None,
+    json_out: Annotated[
+        str | None, typer.Option("--json", metavar="PATH", help="write the figures as JSON; - prints them")
+    ] = None,
+    quick: Annotated[bool, typer.Option(help="a small share of the cases, to see that it runs")] = False,
+) -> None:
+    """Run the benchmarks and print their figures beside those of the study's method and of public tools."""
+    for name in names or ():
+        if name not in BENCHMARKS:
+            wrong_usage(f"no benchmark is called {name!r}; there are: {', '.join(BENCHMARKS)}")
+    chosen = [BENCHMARKS[name] for name in dict.fromkeys(names or BENCHMARKS)]
+    with reported_errors():
+        out = Path(json_out) if json_out not in (None, "-") else None
+        check_out(out)
+        documents = []
+        for benchmark in chosen:
+            rows = _run(benchmark, quick)
+            documents.append({"name": benchmark.name, "machine": machine(), "rows": _finite(rows)})
+            if json_out != "-":
+                _show(benchmark, rows)
+        document: Any = documents[0] if len(documents) == 1 else documents
+        if json_out == "-":
+            print_json(document)
+        elif out is not None:
+            write_file(out, json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
+            say(f"figures: {out}")
+
+
+def _run(benchmark: Benchmark, quick: bool) -> list[Row]:
+    with progress_bar(f"bench {benchmark.name}") as show:
+        return benchmark.run(quick=quick, progress=lambda share: show(share, benchmark.title))
+
+
+def _show(benchmark: Benchmark, rows: list[Row]) -> None:
+    columns = benchmark.columns(rows)
+    table = plain_table(f"{benchmark.name}: {benchmark.title}", tuple(name for name, _ in columns))
+    for column in table.columns[:2]:
+        column.justify = "left"
+    for row in rows:
+        table.add_row(*(text(row.get(name)) for name, text in columns))
+    results.print(table)
+
+
+def _finite(rows: list[Row]) -> list[Row]:
+    """Rows as JSON has them: what is no number is null."""
+    return [
+        {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in row.items()} for row in rows
+    ]

@@ -1,0 +1,76 @@
+"""The benchmarks by name, imported when one is run: each is a module with ``run`` and, if it has one, ``columns``.
+
+``run(*, quick, progress)`` gives rows, ``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs for
+the table that a person reads.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+Row = dict[str, object]
+Progress = Callable[[float], None]
+Column = tuple[str, Callable[[Any], str]]
+
+_LIBRARIES = ("numpy", "scipy", "opencv-python-headless")
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """A benchmark: what it compares, and its module."""
+
+    name: str
+    title: str
+    module: str
+
+    def run(self, *, quick: bool, progress: Progress | None = None) -> list[Row]:
+        """Run it; ``quick``: a small share of its cases."""
+        rows: list[Row] = importlib.import_module(self.module).run(quick=quick, progress=progress)
+        return rows
+
+    def columns(self, rows: list[Row]) -> list[Column]:
+        """How a person reads the rows."""
+        module = importlib.import_module(self.module)
+        if hasattr(module, "columns"):
+            chosen: list[Column] = module.columns()
+            return chosen
+        names = dict.fromkeys(name for row in rows for name in row)
+        return [(name, readable) for name in names]
+
+
+BENCHMARKS = {
+    benchmark.name: benchmark
+    for benchmark in (
+        Benchmark(
+            "levels", "the joint and the study's alternating method on the same simulated studio", "benchmarks.levels"
+        ),
+        Benchmark("detect", "finding a chessboard, beside OpenCV's detectors", "benchmarks.detect"),
+        Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
+    )
+}
+
+
+def readable(value: Any) -> str:
+    """A figure in at most five digits, a text as it is, nothing for None."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
+
+
+def machine() -> dict[str, object]:
+    """What the seconds of a run depend on."""
+    return {
+        "system": platform.system(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
+    }
