@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import typer
+import io
+import sys
 
-from app.cli.demo import demo
-
-cli = typer.Typer(
-    name="lensmatch",
-    help="Lens calibration for broadcast and virtual production: pictures in, lens table out.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-cli.command()(demo)
-
-
-@cli.callback()
-def _root() -> None:
-    """Lens calibration for broadcast and virtual production: pictures in, lens table out."""
+from app.cli.commands import cli
 
 
 def main() -> None:
     """Entry point of the ``lensmatch`` command."""
-    cli()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # Redirected, Windows would write in its old code page; a lens may have any name.
+            stream.reconfigure(encoding=None if stream.isatty() else "utf-8", errors="backslashreplace")
+    cli(prog_name="lensmatch")
 
 
 if __name__ == "__main__":

@@ -57,8 +57,8 @@ def to_light(values: NDArray[np.uint8], transfer: Transfer) -> NDArray[np.float3
 def decode_picture(data: bytes, *, expected_size: tuple[int, int] | None = None) -> Picture:
     """Decode a PNG, JPEG or BMP file to a picture (H, W, 3) uint8 BGR.
 
-    The header is read first: a picture of more than ``calibration.MAX_PICTURE_PIXELS``, or of another size than ``expected_size``
-    (width, height), is refused before any pixel is decoded. Raises :class:`InvalidInput`.
+    The header is read first: a picture of more than ``calibration.MAX_PICTURE_PIXELS``, or of another size than
+    ``expected_size`` (width, height), is refused before any pixel is decoded. Raises :class:`InvalidInput`.
     """
     if not data:
         raise InvalidInput("picture", "0 bytes", "the picture is empty")

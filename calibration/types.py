@@ -126,8 +126,8 @@ class Target:
     def grid(self) -> tuple[int, int]:
         """(columns, rows) of the target's points: inner corners of a board, 2 x 2 corners of a square, 1 x 1 light."""
         if self.kind is TargetKind.CHESSBOARD:
-            assert self.squares is not None  # checked in __post_init__
-            return self.squares[0] - 1, self.squares[1] - 1
+            columns, rows = self.squares or (0, 0)  # they are there: see __post_init__
+            return columns - 1, rows - 1
         return (2, 2) if self.kind is TargetKind.SQUARE else (1, 1)
 
     def points_m(self) -> FloatArray:
@@ -150,11 +150,10 @@ class Target:
     def outline_m(self) -> tuple[float, float]:
         """Width and height of the whole target in metres."""
         if self.kind is TargetKind.CHESSBOARD:
-            assert self.squares is not None and self.square_m is not None  # checked in __post_init__
-            return self.squares[0] * self.square_m, self.squares[1] * self.square_m
+            columns, rows = self.squares or (0, 0)  # both are there: see __post_init__
+            return columns * (self.square_m or 0.0), rows * (self.square_m or 0.0)
         if self.kind is TargetKind.SQUARE:
-            assert self.size_m is not None  # checked in __post_init__
-            return self.size_m
+            return self.size_m or (0.0, 0.0)
         diameter = self.diameter_m or 0.0
         return diameter, diameter
 

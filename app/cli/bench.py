@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.console import check_out, print_json, progress_bar, reported_errors, results, say, write_file, wrong_usage
-from app.cli.tables import plain_table
+from app.cli.console import check_out, print_json, progress_bar, reported_errors, say, write_file, wrong_usage
+from app.cli.tables import plain_table, print_table
 from benchmarks.registry import BENCHMARKS, Benchmark, Row, machine
 
 
@@ -21,7 +21,7 @@ def bench(
     json_out: Annotated[
         str | None, typer.Option("--json", metavar="PATH", help="write the figures as JSON; - prints them")
     ] = None,
-    quick: Annotated[bool, typer.Option(help="a small share of the cases, to see that it runs")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="a small share of the cases, to see that it runs")] = False,
 ) -> None:
     """Run the benchmarks and print their figures beside those of the study's method and of public tools."""
     for name in names or ():
@@ -57,7 +57,7 @@ def _show(benchmark: Benchmark, rows: list[Row]) -> None:
         column.justify = "left"
     for row in rows:
         table.add_row(*(text(row.get(name)) for name, text in columns))
-    results.print(table)
+    print_table(table)
 
 
 def _finite(rows: list[Row]) -> list[Row]:

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from app.cli.console import EXIT_FAILED, check_out, fail, print_json, reported_errors, results, write_file, wrong_usage
-from app.cli.tables import plain_table
+from app.cli.tables import plain_table, print_table
 from calibration.detect.target import find_target
 from calibration.errors import CalibrationError, InvalidInput
 from calibration.image import Transfer, decode_picture
@@ -123,7 +123,7 @@ def _show(found: Detection, wanted: Target, seconds: float) -> None:
     for number, (u, v), (sigma_u, sigma_v) in zip(found.point_ids, found.points_px, sigmas, strict=True):
         row, column = divmod(int(number), columns)
         table.add_row(str(column), str(row), f"{u:.4f}", f"{v:.4f}", f"{sigma_u:.4f}", f"{sigma_v:.4f}")
-    results.print(table)
+    print_table(table)
     blur = "not told" if math.isnan(found.blur_px) else f"{found.blur_px:.2f} px"
     results.print(
         f"{len(found.points_px)} of {len(wanted.points_m())} points, centre ({found.centre_px[0]:.3f}, "

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from app.bootstrap import Service, running_service
-from app.cli.console import WorkFailed
+from app.cli.console import Show, WorkFailed
 from app.documents import JobRequest
 from app.engines import Engines
 from app.events import TERMINAL_KINDS, message
 from app.settings import Settings
-from calibration.tables import LensTable
+from calibration.tables import LensTable, LevelStatus
 from storage.errors import NotFound
 from storage.records import JobState, PictureKind
 
 _LOOK_AGAIN_S = 5.0
 # Events wake the listener; this only bounds the wait if a wake-up were ever missed.
 
-Show = Callable[[float, str], None]
+__all__ = ["FinishedJob", "Show", "run_job"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,12 +45,18 @@ async def run_job(settings: Settings, engines: Engines, request: JobRequest, sho
             raise
         record = await service.repository.get_job(record.id)
         if record.state is not JobState.DONE:
-            raise WorkFailed(f"the job {record.state.value}: {record.reason}")
+            raise WorkFailed(f"the job {record.state.value}: {record.reason}{await _kept(service, record.id)}")
         summary = await service.repository.table_of_job(record.id)
         if summary is None:
             raise WorkFailed(f"job {record.id} is done but left no table; the store may have been changed meanwhile")
         table = (await service.repository.get_table(summary.id)).table
         return FinishedJob(record.id, table, await _pictures(service, record.id))
+
+
+async def _kept(service: Service, job_id: str) -> str:
+    levels = await service.repository.list_levels(job_id)
+    measured = sum(level.result.status is not LevelStatus.FAILED for level in levels)
+    return f" ({measured} finished levels of job {job_id} are kept in {service.settings.database})" if measured else ""
 
 
 async def _follow(service: Service, job_id: str, levels: int, show: Show) -> None:

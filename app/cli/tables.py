@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from rich import box
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from app.cli.console import messages, results
 from calibration.tables import LensTable, LevelResult, LevelStatus, PixelError
+
+_WIDEST = 400
 
 _COLOURS = {LevelStatus.OK: "green", LevelStatus.DEGRADED: "yellow", LevelStatus.FAILED: "red"}
 
@@ -22,6 +25,12 @@ def plain_table(title: str, names: tuple[str, ...]) -> Table:
     return table
 
 
+def print_table(table: Table) -> None:
+    """Print a table whole: where the terminal is narrower, its lines wrap instead of losing figures."""
+    wide = results.options.update(max_width=_WIDEST)
+    results.print(table, width=Measurement.get(results, wide, table).maximum)
+
+
 def show_table(table: LensTable) -> None:
     """Print the levels; reasons and pictures left out go to standard error, one line each."""
     grid = plain_table(
@@ -30,7 +39,7 @@ def show_table(table: LensTable) -> None:
     )
     for level in table.levels:
         _add_level(grid, level)
-    results.print(grid)
+    print_table(grid)
     for level in table.levels:
         _tell_reasons(level)
 

@@ -26,16 +26,16 @@ def scale_end_px(largest_px: float) -> float:
     return float(next(step for step in _STEPS if step * decade >= largest_px * (1 - 1e-9)) * decade)
 
 
-def heat_map(map_px: FloatArray, image_size: tuple[int, int]) -> Picture:
+def heat_map(map_px: FloatArray, image_size: tuple[int, int], end_px: float | None = None) -> Picture:
     """The map (rows, columns) of px, first and last samples on the picture's outermost pixels, as a picture (BGR).
 
-    Colours are viridis (readable without colour vision) from 0 to :func:`scale_end_px` of the largest finite value.
-    NaN (no ray there) is grey, infinity (the lens folds there) red. A ring marks the largest value; the foot says it.
+    Colours are viridis (readable without colour vision) from 0 to ``end_px``, else to :func:`scale_end_px` of the
+    largest finite value. NaN (no ray there) is grey, infinity (the lens folds there) red. A ring marks the largest value; the foot says it.
     """
     width, height = image_size
     map_height = max(round(_MAP_WIDTH * height / width), 120)
     finite = map_px[np.isfinite(map_px)]
-    end = scale_end_px(float(finite.max()) if finite.size else 0.0)
+    end = end_px or scale_end_px(float(finite.max()) if finite.size else 0.0)
     canvas = np.full(
         (map_height + _MARGIN + _FOOT, _MARGIN + _MAP_WIDTH + _BAR_GAP + _BAR_WIDTH + _LABELS_WIDTH, 3),
         _PAPER,

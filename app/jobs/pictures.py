@@ -24,7 +24,7 @@ _JPEG_QUALITY = 90
 _CAMERA, _ENGINE = (233, 200, 70), (30, 120, 255)
 # Light blue and orange are told apart without colour vision too.
 _WHITE, _INK, _ARROW = (255, 255, 255), (24, 24, 24), (60, 60, 200)
-_INSET_ZOOM, _INSET_HALF = 8, 16
+_INSET_ZOOM, _INSET_HALF = 14, 16
 _ARROW_PX = 14.0
 _FAR_PX = 1e4
 # Beyond this OpenCV's fixed-point coordinates would wrap round.
@@ -103,7 +103,7 @@ def overlay_picture(real: SeenPicture, drawn_px: FloatArray, grid: tuple[int, in
     """The camera's picture, darkened, with the corners it shows (rings) and the engine's (grid of lines).
 
     ``drawn_px``: the engine's (N, 2), row by row of the target's ``grid`` (columns, rows), NaN where unknown. The foot
-    says how far they are apart at most; an inset shows the surroundings of that corner eight times larger.
+    says how far they are apart at most; an inset shows the surroundings of that corner fourteen times larger.
     """
     canvas = _darkened(real.picture)
     found_px = np.full_like(drawn_px, np.nan)
@@ -112,7 +112,7 @@ def overlay_picture(real: SeenPicture, drawn_px: FloatArray, grid: tuple[int, in
     drawn_px = np.where(reachable, drawn_px, np.nan)
     _grid_lines(canvas, drawn_px, grid)
     for u, v in found_px[np.isfinite(found_px).all(axis=1)]:
-        _ring(canvas, float(u), float(v), 7.0, _CAMERA, 2)
+        _ring(canvas, float(u), float(v), 7.0, _CAMERA, 3)
     distance = np.linalg.norm(found_px - drawn_px, axis=1)
     if not np.isfinite(distance).any():
         return _with_foot(canvas, f"{title}: the target is not in the picture")
@@ -177,9 +177,9 @@ def _grid_lines(canvas: Picture, points_px: FloatArray, grid: tuple[int, int]) -
     pairs += [(table[r, c], table[r + 1, c]) for r in range(rows - 1) for c in range(columns)]
     for start, end in pairs:
         if np.isfinite(start).all() and np.isfinite(end).all():
-            cv2.line(canvas, _fixed(*start), _fixed(*end), _ENGINE, 2, cv2.LINE_AA, 4)
+            cv2.line(canvas, _fixed(*start), _fixed(*end), _ENGINE, 3, cv2.LINE_AA, 4)
     if not pairs and np.isfinite(points_px).all():
-        _cross(canvas, float(points_px[0, 0]), float(points_px[0, 1]), 9, _ENGINE, 2)
+        _cross(canvas, float(points_px[0, 0]), float(points_px[0, 1]), 9, _ENGINE, 3)
 
 
 def _ring(canvas: Picture, u: float, v: float, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
@@ -194,13 +194,12 @@ def _cross(canvas: Picture, u: float, v: float, size: int, colour: tuple[int, in
 
 def _inset(canvas: Picture, picture: Picture, found: FloatArray, drawn: FloatArray) -> None:
     height, width = picture.shape[:2]
-    half = _INSET_HALF
-    if width < 20 * half or height < 20 * half:
+    half, side = _INSET_HALF, 2 * _INSET_HALF * _INSET_ZOOM
+    if width < 2 * side or height < 2 * side:
         return
     u = int(np.clip(round(float(found[0])), half, width - half - 1))
     v = int(np.clip(round(float(found[1])), half, height - half - 1))
     crop = picture[v - half : v + half, u - half : u + half]
-    side = 2 * half * _INSET_ZOOM
     large: NDArray[np.uint8] = np.asarray(
         cv2.resize(_darkened(np.ascontiguousarray(crop)), (side, side), interpolation=cv2.INTER_NEAREST), dtype=np.uint8
     )
@@ -208,23 +207,23 @@ def _inset(canvas: Picture, picture: Picture, found: FloatArray, drawn: FloatArr
         # The middle of a pixel is half an enlarged pixel in.
         at = [(float(value) - (middle - half) + 0.5) * _INSET_ZOOM - 0.5 for value, middle in ((x, u), (y, v))]
         if is_camera:
-            _ring(large, at[0], at[1], 22.0, _CAMERA, 3)
+            _ring(large, at[0], at[1], 36.0, _CAMERA, 5)
         else:
-            _cross(large, at[0], at[1], 60, _ENGINE, 2)
+            _cross(large, at[0], at[1], 110, _ENGINE, 3)
     # Put where the corner is not.
     top = 24 if v > height / 2 else height - side - 24
     left = 24 if u > width / 2 else width - side - 24
     canvas[top : top + side, left : left + side] = large
     cv2.rectangle(canvas, (left - 1, top - 1), (left + side, top + side), _WHITE, 2)
     cv2.rectangle(canvas, (u - half, v - half), (u + half, v + half), _WHITE, 2)
-    label = f"{_INSET_ZOOM}x, the corner farthest off"
-    cv2.putText(canvas, label, (left + 10, top + side - 12), cv2.FONT_HERSHEY_SIMPLEX, 0.65, _WHITE, 1, cv2.LINE_AA)
+    label = f"{_INSET_ZOOM} x, the corner farthest off"
+    cv2.putText(canvas, label, (left + 14, top + side - 16), cv2.FONT_HERSHEY_SIMPLEX, 1.0, _WHITE, 2, cv2.LINE_AA)
 
 
 def _with_foot(canvas: Picture, text: str) -> Picture:
     width = canvas.shape[1]
     scale = min(1.0, width / 1920)
-    band = np.full((round(56 * scale), width, 3), 255, dtype=np.uint8)
-    at = (round(24 * scale), round(38 * scale))
-    cv2.putText(band, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
+    band = np.full((round(80 * scale), width, 3), 255, dtype=np.uint8)
+    at = (round(24 * scale), round(54 * scale))
+    cv2.putText(band, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.4 * scale, _INK, 1, cv2.LINE_AA)
     return np.vstack([canvas, band])

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from app.report.numbers import MINUS
 
 WIDTH, HEIGHT = 460.0, 300.0
-LEFT, RIGHT, TOP, BOTTOM = 66.0, 14.0, 16.0, 46.0
+LEFT, RIGHT, TOP, BOTTOM = 80.0, 14.0, 16.0, 46.0
 SHAPES = ("circle", "square", "triangle", "diamond")
 _DASHES = ("", "7 4", "2 4", "9 3 2 3")
 _LABEL_STEP_X, _LABEL_STEP_Y = 70.0, 36.0
@@ -42,7 +42,9 @@ class Chart:
     log_y: bool = False
     from_zero: bool = False
     equal: bool = False
-    """Same scale on both axes."""
+    """Same scale on both axes, y downwards."""
+    bands: Sequence[float] = ()
+    """Heights of faint lines across, for example plus and minus one sigma."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,9 @@ class _Axis:
     log: bool = False
 
     def at(self, value: float) -> float:
-        low, high, value = (math.log(v) for v in (self.low, self.high, value)) if self.log else (self.low, self.high, value)
+        low, high, value = (
+            (math.log(v) for v in (self.low, self.high, value)) if self.log else (self.low, self.high, value)
+        )
         return self.start + (value - low) / (high - low) * (self.end - self.start)
 
 
@@ -72,6 +76,7 @@ def draw(chart: Chart) -> Markup:
             WIDTH, HEIGHT, f"{chart.title}: {chart.y_title} over {chart.x_title}, {len(points)} points"
         ),
         *_grid(x, y, chart),
+        *(_path([(x.low, b), (x.high, b)], x, y, "band") for b in chart.bands if y.low <= b <= y.high),
         *(_path(line, x, y, "truth") for line in faint if len(line) > 1),
         *(part for s in series for part in _series(s, x, y)),
         *_words(chart.labels, x, y, chart.log_y),
@@ -91,9 +96,7 @@ def legend_mark(style: int, hollow: bool, line: bool) -> Markup:
 def _finite(series: Series, log_y: bool) -> Series:
     sigma = series.sigma or [None] * len(series.points)
     kept = [(p, s) for p, s in zip(series.points, sigma, strict=True) if _drawable(p, log_y)]
-    return Series(
-        series.name, [p for p, _ in kept], series.style, [s for _, s in kept], series.line, series.hollow
-    )
+    return Series(series.name, [p for p, _ in kept], series.style, [s for _, s in kept], series.line, series.hollow)
 
 
 def _drawable(point: tuple[float, float], log_y: bool) -> bool:
@@ -172,9 +175,9 @@ def _grid(x: _Axis, y: _Axis, chart: Chart) -> Iterator[Markup]:
     )
     yield _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, chart.x_title, "middle", "title")
     middle = (TOP + HEIGHT - BOTTOM) / 2
-    yield Markup('<text class="title" x="14" y="{0:.1f}" text-anchor="middle" transform="rotate(-90 14 {0:.1f})">{1}</text>').format(
-        middle, chart.y_title
-    )
+    yield Markup(
+        '<text class="title" x="14" y="{0:.1f}" text-anchor="middle" transform="rotate(-90 14 {0:.1f})">{1}</text>'
+    ).format(middle, chart.y_title)
 
 
 def _text(x: float, y: float, text: str, anchor: str, kind: str = "tick") -> Markup:
@@ -229,6 +232,7 @@ def _marker(style: int, x: float, y: float, hollow: bool) -> Markup:
 def _words(labels: Sequence[tuple[float, float, str]], x: _Axis, y: _Axis, log_y: bool) -> Iterator[Markup]:
     for px, py, text in labels:
         if _drawable((px, py), log_y):
-            at = x.at(px)
-            left = at < WIDTH - RIGHT - 70
-            yield _text(at + (9 if left else -9), y.at(py) - 7, text, "start" if left else "end", "word")
+            at_x, at_y = x.at(px), y.at(py)
+            above = at_y < (TOP + HEIGHT - BOTTOM) / 2
+            anchor = "end" if at_x > (LEFT + WIDTH - RIGHT) / 2 else "start"
+            yield _text(at_x, at_y + (-10 if above else 20), text, anchor, "word")

@@ -15,7 +15,12 @@ from calibration.lens import Lens
 _TRUTH_STEPS = 80
 _LOG_FROM_RATIO = 30.0
 
+_ZOOM = "zoom (encoder, 0 wide to 1 tele)"
+
 Point = tuple[float, float]
+Groups = Sequence[Sequence[LevelReport]]
+Get = Callable[[LevelReport], float | None]
+OfLens = Callable[[Lens], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +40,14 @@ def charts(report: RunReport) -> list[Figure]:
     focuses = sorted({level.result.focus for level in measured})
     groups = [sorted((m for m in measured if m.result.focus == f), key=lambda m: m.result.zoom) for f in focuses]
     figures = [
-        _over_zoom(report, groups, "Field of view", "horizontal FoV, degrees (log)", _fov, lambda t: t.fov_x_deg, log=True),
+        _over_zoom(
+            report, groups, "Field of view", "horizontal FoV, degrees (log)", _fov, lambda t: t.fov_x_deg, log=True
+        ),
         _over_zoom(report, groups, "Distortion k1", "k1, radius 1 at half width", _k1_hw, lambda t: t.k1_hw),
         _over_zoom(report, groups, "Distortion k2", "k2, radius 1 at half width", _k2_hw, lambda t: t.k2_hw),
         _shift_path(report, groups),
-        _overlay_errors(report, measured),
+        _overlay_errors(report, groups),
+        _pulls(groups) if any(level.truth for level in measured) else _residuals(groups),
     ]
     return [figure for figure in figures if figure.svg]
 
@@ -66,13 +74,33 @@ def half_width_sigma(level: LevelReport, order: int) -> float | None:
     return float(sigma * value_hw / value)
 
 
+def _shift(index: int) -> tuple[Get, Get, OfLens]:
+    def value(level: LevelReport) -> float | None:
+        return None if level.result.center_shift_px is None else level.result.center_shift_px[index]
+
+    def sigma(level: LevelReport) -> float | None:
+        told = level.result.sigma.center_shift_px
+        return None if told is None else told[index]
+
+    return value, sigma, lambda truth: truth.center_shift_px[index]
+
+
+_PULLS: tuple[tuple[str, Get, Get, OfLens], ...] = (
+    ("FoV", lambda m: m.result.fov_x_deg, lambda m: m.result.sigma.fov_x_deg, lambda t: t.fov_x_deg),
+    ("k1", lambda m: m.result.k1, lambda m: m.result.sigma.k1, lambda t: t.k1),
+    ("k2", lambda m: m.result.k2, lambda m: m.result.sigma.k2, lambda t: t.k2),
+    ("shift right", *_shift(0)),
+    ("shift down", *_shift(1)),
+)
+
+
 def _over_zoom(
     report: RunReport,
-    groups: Sequence[Sequence[LevelReport]],
+    groups: Groups,
     caption: str,
     y_title: str,
     found: Callable[[LevelReport], tuple[float | None, float | None]],
-    true: Callable[[Lens], float],
+    true: OfLens,
     *,
     log: bool = False,
 ) -> Figure:
@@ -81,18 +109,20 @@ def _over_zoom(
         told = [(level.result.zoom, *found(level)) for level in group]
         points = [(zoom, value, sigma) for zoom, value, sigma in told if value is not None]
         name = f"focus {encoder(group[0].result.focus)}"
-        series.append(Series(name, [(z, v) for z, v, _ in points], style, [s for _, _, s in points]))
+        line = report.truth_at is None
+        series.append(Series(name, [(z, v) for z, v, _ in points], style, [s for _, _, s in points], line))
     faint = [[(zoom, true(lens)) for zoom, lens in curve] for curve in _truth_curves(report, groups)]
-    return _figure(Chart(caption, "zoom (encoder, 0 wide to 1 tele)", y_title, series, faint, log_y=log))
+    return _figure(Chart(caption, _ZOOM, y_title, series, faint, log_y=log))
 
 
-def _shift_path(report: RunReport, groups: Sequence[Sequence[LevelReport]]) -> Figure:
+def _shift_path(report: RunReport, groups: Groups) -> Figure:
     series = []
     labels = []
     for style, group in enumerate(groups):
         told = [(r.result.zoom, r.result.center_shift_px) for r in group]
         path = [(zoom, shift) for zoom, shift in told if shift is not None]
-        series.append(Series(f"focus {encoder(group[0].result.focus)}", [shift for _, shift in path], style))
+        name = f"focus {encoder(group[0].result.focus)}"
+        series.append(Series(name, [shift for _, shift in path], style, line=report.truth_at is None))
         if style == 0 and len(path) > 1:
             labels = [(*shift, f"zoom {encoder(zoom)}") for zoom, shift in (path[0], path[-1])]
     faint = [[lens.center_shift_px for _, lens in curve] for curve in _truth_curves(report, groups)]
@@ -100,12 +130,8 @@ def _shift_path(report: RunReport, groups: Sequence[Sequence[LevelReport]]) -> F
     return _figure(chart, "path of the principal point from wide to tele, same scale on both axes")
 
 
-def _overlay_errors(report: RunReport, measured: Sequence[LevelReport]) -> Figure:
-    def points(value: Callable[[LevelReport], float | None]) -> list[Point]:
-        told = [(level.result.zoom, value(level)) for level in measured]
-        return [(zoom, px) for zoom, px in told if px is not None]
-
-    def largest(name: str) -> Callable[[LevelReport], float | None]:
+def _overlay_errors(report: RunReport, groups: Groups) -> Figure:
+    def largest(name: str) -> Get:
         def value(level: LevelReport) -> float | None:
             error = getattr(level.result, name)
             return None if error is None else float(error.max)
@@ -113,26 +139,84 @@ def _overlay_errors(report: RunReport, measured: Sequence[LevelReport]) -> Figur
         return value
 
     series = [
-        Series("expected (one sigma, from the fit)", points(largest("predicted_overlay_px")), 0, line=False, hollow=True),
-        Series(f"true, against {report.truth_name}", points(lambda m: m.error.max_px if m.error else None), 1, line=False),
         Series(
-            "engine's render against the camera, corners (with their noise)",
-            points(largest("engine_overlay_px")), 2, line=False, hollow=True,
+            "expected: one sigma, from the fit",
+            _points(groups, largest("predicted_overlay_px")),
+            0,
+            line=False,
+            hollow=True,
+        ),
+        Series(f"true: against {report.truth_name}", _points(groups, _true_max), 1, line=False),
+        Series(
+            "engine's render against the camera at its corners",
+            _points(groups, largest("engine_overlay_px")),
+            2,
+            line=False,
+            hollow=True,
         ),
     ]
+    return _errors("Overlay error", "the largest anywhere in the picture", "largest overlay error, px", series)
+
+
+def _true_max(level: LevelReport) -> float | None:
+    return None if level.error is None else level.error.max_px
+
+
+def _pulls(groups: Groups) -> Figure:
+    series = []
+    for style, (name, value, sigma, true) in enumerate(_PULLS):
+
+        def pull(level: LevelReport, value: Get = value, sigma: Get = sigma, true: OfLens = true) -> float | None:
+            found, spread = value(level), sigma(level)
+            return None if found is None or not spread or level.truth is None else (found - true(level.truth)) / spread
+
+        series.append(Series(name, _points(groups, pull, (style - 2) * 0.012), style, line=False))
+    chart = Chart(
+        "Error in sigmas",
+        _ZOOM,
+        "(found − truth) / sigma",
+        [s for s in series if s.points],
+        bands=(-2, -1, 1, 2),
+        from_zero=False,
+    )
+    return _figure(chart, "two in three should lie within 1, nineteen in twenty within 2")
+
+
+def _residuals(groups: Groups) -> Figure:
+    def rms(name: str) -> Get:
+        def value(level: LevelReport) -> float | None:
+            error = getattr(level.result, name)
+            return None if error is None else float(error.rms)
+
+        return value
+
+    series = [
+        Series("residual", _points(groups, rms("residual_px")), 0, line=False),
+        Series("held out of the fit", _points(groups, rms("held_out_px"), 0.01), 1, line=False, hollow=True),
+    ]
+    return _errors("Residuals", "RMS per coordinate", "RMS per coordinate, px", series)
+
+
+def _errors(title: str, remark: str, y_title: str, series: Sequence[Series]) -> Figure:
     series = [s for s in series if s.points]
     values = [y for s in series for _, y in s.points if y > 0]
     log = bool(values) and max(values) / min(values) > _LOG_FROM_RATIO
-    title = "largest overlay error, px" + (" (log)" if log else "")
-    chart = Chart(
-        "Overlay error", "zoom (encoder, 0 wide to 1 tele)", title, series, log_y=log, from_zero=not log
-    )
-    return _figure(chart, "the largest anywhere in the picture")
+    y_title += " (log)" if log else ""
+    return _figure(Chart(title, _ZOOM, y_title, series, log_y=log, from_zero=not log), remark)
 
 
-def _truth_curves(
-    report: RunReport, groups: Sequence[Sequence[LevelReport]]
-) -> list[list[tuple[float, Lens]]]:
+def _points(groups: Groups, value: Get, aside: float = 0.0) -> list[Point]:
+    """(zoom, value) of every level that tells it, the focuses of one zoom beside each other."""
+    zooms = [level.result.zoom for group in groups for level in group]
+    span = max(zooms) - min(zooms) or 1.0
+    points = []
+    for index, group in enumerate(groups):
+        shift = (aside + (index - (len(groups) - 1) / 2) * min(0.03, 0.1 / len(groups))) * span
+        points += [(level.result.zoom + shift, told) for level in group if (told := value(level)) is not None]
+    return points
+
+
+def _truth_curves(report: RunReport, groups: Groups) -> list[list[tuple[float, Lens]]]:
     curves = []
     for group in groups:
         zooms = [level.result.zoom for level in group]
@@ -148,6 +232,13 @@ def _truth_curves(
 def _figure(chart: Chart, remark: str = "") -> Figure:
     legend = [(legend_mark(s.style, s.hollow, s.line), s.name) for s in chart.series]
     if any(len(line) > 1 for line in chart.faint):
-        legend.append((Markup('<svg class="mark" viewBox="0 0 24 12" aria-hidden="true"><path class="truth" d="M0 6H24"/></svg>'), "truth"))
+        legend.append(
+            (
+                Markup(
+                    '<svg class="mark" viewBox="0 0 24 12" aria-hidden="true"><path class="truth" d="M0 6H24"/></svg>'
+                ),
+                "truth",
+            )
+        )
     caption = f"{chart.title}: {remark}" if remark else chart.title
     return Figure(caption, draw(chart), tuple(legend))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from app.jobs.heatmap import heat_map
+from app.jobs.heatmap import heat_map, scale_end_px
 from app.jobs.pictures import jpeg
 from app.report.embed import Image, embedded
 from app.report.figures import half_width_sigma
@@ -221,14 +221,14 @@ def level_view(level: LevelReport, table: LensTable, opened: bool) -> LevelView:
 
 
 _SHOWN = (
-    (PictureKind.BEFORE, "Before", "Camera (rings) and the target as the engine drew it with the values found in it."),
-    (PictureKind.OVERLAY, "After", "Camera (rings) and the engine's own render at the published values (grid)."),
-    (PictureKind.RESIDUALS, "Residuals", "Model minus picture of every corner of every picture, enlarged."),
-    (PictureKind.UNCERTAINTY, "Expected overlay error", "One sigma of the distance, from the fit's covariance."),
-    (PictureKind.REAL, "Camera", "The camera's picture."),
-    (PictureKind.VIRTUAL, "Engine", "The engine's own render."),
+    (PictureKind.BEFORE, "Before", "camera (rings), engine with the values as found (grid)"),
+    (PictureKind.OVERLAY, "After", "camera (rings), engine's render at the published values (grid)"),
+    (PictureKind.UNCERTAINTY, "Expected overlay error", "one sigma, from the fit's covariance"),
+    (PictureKind.RESIDUALS, "Residuals", "model minus picture, every corner of every picture"),
+    (PictureKind.REAL, "Camera", "as fetched"),
+    (PictureKind.VIRTUAL, "Engine", "its own render"),
 )
-_SMALL = (PictureKind.REAL, PictureKind.VIRTUAL)
+_RAW = (PictureKind.REAL, PictureKind.VIRTUAL)
 
 
 def _images(level: LevelReport, table: LensTable, where: str) -> list[Image]:
@@ -236,18 +236,25 @@ def _images(level: LevelReport, table: LensTable, where: str) -> list[Image]:
     expected = level.expected()
     if PictureKind.UNCERTAINTY not in files and expected is not None:
         files = {**files, PictureKind.UNCERTAINTY: jpeg(heat_map(expected.map_px, table.image_size))}
-    images = [
-        embedded(files[kind], title, text, f"{title}, {where}: {text}", small=kind in _SMALL)
-        for kind, title, text in _SHOWN
-        if kind in files
-    ]
-    if level.error is not None:
-        text = "Distance between where the result and the truth put the same ray."
-        image = jpeg(heat_map(level.error.map_px, table.image_size))
-        place = next((i for i, shown in enumerate(images) if shown.small), len(images))
-        title = "True overlay error"
-        images.insert(place, embedded(image, title, text, f"{title}, {where}: {text}"))
+    images = []
+    for kind, title, text in _SHOWN:
+        if kind in files:
+            # Where the overlay shows them too, the bare pictures are small.
+            small = kind in _RAW and PictureKind.OVERLAY in files
+            images.append(embedded(files[kind], title, text, f"{title}, {where}: {text}", small=small))
+        if kind is PictureKind.UNCERTAINTY and level.error is not None:
+            data = jpeg(heat_map(level.error.map_px, table.image_size, _common_end_px(level)))
+            title, text = "True overlay error", "the result against the truth"
+            images.append(embedded(data, title, text, f"{title}, {where}: {text}"))
     return images
+
+
+def _common_end_px(level: LevelReport) -> float | None:
+    """The true map has the colours of the expected one wherever its values fit into them."""
+    expected = level.result.predicted_overlay_px
+    if level.error is None or expected is None or not level.error.max_px <= expected.max:
+        return None
+    return scale_end_px(expected.max)
 
 
 def _used_pictures(level: LevelReport) -> list[tuple[str, str, str, str, str]]:

@@ -114,7 +114,10 @@ def _table_facts(table: LensTable) -> list[tuple[str, str]]:
     width, height = table.image_size
     facts = [
         ("levels", f"{len(table.levels)} (zoom {_range(zooms)}, focus {_range(focuses)})"),
-        ("picture", f"{width} × {height} px" + (f", pixel aspect {table.pixel_aspect:g}" if table.pixel_aspect != 1 else "")),
+        (
+            "picture",
+            f"{width} × {height} px" + (f", pixel aspect {table.pixel_aspect:g}" if table.pixel_aspect != 1 else ""),
+        ),
     ]
     if table.sensor_mm is not None:
         facts.append(("sensor", f"{table.sensor_mm[0]:g} × {table.sensor_mm[1]:g} mm"))

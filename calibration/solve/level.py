@@ -38,10 +38,8 @@ _OUTLIER_CHI2 = 25.0
 _VIEW_OUTLIERS = 0.3
 # A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
 _FLOOR_ROUNDS = 6
-_NODAL_SIGNIFICANT = 5.0
-_NODAL_MISFIT = 1.25
-# Sigmas by which the pictures must contradict the nodal offset that was given, and how much larger it must make the
-# residuals, before theirs is used instead: small errors common to all pictures (a survey) move it by many sigmas, too.
+_NODAL_SIGNIFICANT = 4.0
+# Sigmas by which the pictures must contradict the nodal offset that was given before theirs is used instead.
 _UNTOLD = 0.3
 # A quantity whose sigma is above this share of its prior's says no more than the prior.
 
@@ -136,13 +134,13 @@ def solve_level(
     seen = None if fit.sigma_nodal_mm is None else (fit.lens.nodal_offset_mm, fit.sigma_nodal_mm)
     nodal_told = False
     if seen is not None:
-        given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
-        as_given = _Fit(kept, given, fitted.free_poses(), held=("nodal_offset_mm",))
-        nodal_told = abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1] and as_given.contradicted_by(fitted)
+        nodal_told = abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
         if not nodal_told:
             # What contradicts nothing stays as given: left free, it would only take exactness from the field of view.
-            as_given.run()
-            fitted, fit = as_given, as_given.result(tuple(dropped))
+            given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
+            fitted = _Fit(kept, given, fitted.free_poses(), held=("nodal_offset_mm",))
+            fitted.run()
+            fit = fitted.result(tuple(dropped))
     held = _untold(fit)
     if held:
         kept_nodal = () if nodal_told else ("nodal_offset_mm",)
@@ -252,19 +250,6 @@ class _Fit:
                 break
         self.floor_px = self._floor_for_chi2()
         self.iterate(robust=False)
-
-    def contradicted_by(self, other: _Fit) -> bool:
-        """Whether this fit, with the points and the floor of ``other``, leaves clearly larger residuals than it."""
-        self.used, self.floor_px = other.used.copy(), other.floor_px
-        try:
-            self.iterate(robust=False)
-        except (NotConverged, NotEnoughData):
-            return True
-        mine, theirs = (
-            np.sqrt(np.mean(f.problem.evaluate(f.state, jacobian=False).residual_px[other.used] ** 2))
-            for f in (self, other)
-        )
-        return bool(mine > _NODAL_MISFIT * theirs)
 
     def iterate(self, *, robust: bool) -> None:
         """Gauss-Newton with Levenberg-Marquardt damping until no point moves; raises NotConverged."""
@@ -400,7 +385,7 @@ class _Fit:
         whiten = self._whitening()
         matrix, _ = self._normal_equations(evaluation, whiten, False)
         lens = self.state.lens
-        inverse = np.asarray(np.linalg.pinv(matrix, hermitian=True), dtype=np.float64)
+        inverse = _inverse(matrix)
         covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
         column = self.problem.nodal_column
         residual = evaluation.residual_px
@@ -440,6 +425,12 @@ class _Fit:
             iterations=self.iterations,
             sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
         )
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of the normal matrix (P, P), its columns first scaled to like size: pixels stand beside millimetres."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return np.asarray(np.linalg.pinv(matrix * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
 
 
 def _to_lens_parameters(lens: Lens, covariance: FloatArray) -> FloatArray:

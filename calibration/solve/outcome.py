@@ -15,6 +15,9 @@ from calibration.types import FloatArray
 USABLE_OVERLAY_PX = 1.0
 """Expected overlay error above which a level is called degraded: a shift that a viewer begins to see."""
 
+_NODAL_HINT = 3.0
+# Sigmas of the nodal offset at which a level is called degraded before it is certain enough to be used.
+
 NODAL_NOT_MEASURED = "not measured: that takes pictures from known head angles of a surveyed target"
 
 
@@ -96,6 +99,13 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
         )
     if fit.untold:
         trouble.append(f"not told by the pictures: {', '.join(fit.untold)}")
+    if fit.nodal_seen_mm is not None and not fit.nodal_told:
+        seen_mm, sigma_mm = fit.nodal_seen_mm
+        if abs(seen_mm - fit.lens.nodal_offset_mm) > _NODAL_HINT * sigma_mm:
+            trouble.append(
+                f"the pictures hint at a nodal offset of {seen_mm:.0f} +- {sigma_mm:.0f} mm, not "
+                f"{fit.lens.nodal_offset_mm:g} mm; if so the field of view is off: add a target at another distance"
+            )
     share = len(fit.outliers) / max(fit.points + len(fit.outliers), 1)
     if share > 0.03:
         trouble.append(f"{share:.0%} of the points disagree with the rest")

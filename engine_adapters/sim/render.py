@@ -216,7 +216,7 @@ def _fixed_point(outline: FloatArray) -> NDArray[np.int32]:
 
 
 def _clipped(view: View, backdrop: tuple[Decoy, ...]) -> list[tuple[NDArray[np.int32], Decoy]]:
-    """The outlines in fixed-point pixels, cut a little outside the picture (so that nothing behind the camera is projected)."""
+    """The outlines in fixed-point pixels, cut outside the picture (so that nothing behind the camera is projected)."""
     if not backdrop:
         return []
     points = view.to_camera(np.concatenate([decoy.outline_m for decoy in backdrop]))

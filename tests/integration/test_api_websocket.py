@@ -168,10 +168,52 @@ async def test_an_ended_job_is_told_and_closed(studio: Studio) -> None:
 async def test_what_comes_after_the_last_event_is_told_too(studio: Studio) -> None:
     job = await studio.job()
     await studio.start(job)
-    await studio.end(job)
+    for _ in range(4):
+        await studio.note(job)
+    await studio.end(job)  # the seventh event, the last of the first page
     await studio.note(job, "published later")
-    async with studio.connect(f"/jobs/{job}/events?after=1") as client:
-        assert seqs(await received(client)) == [2, 3, 4]
+    async with studio.connect(f"/jobs/{job}/events") as client:
+        assert seqs(await received(client)) == list(range(1, 9))
+
+
+@pytest.mark.parametrize("name", ["events_after", "all_events_after"])
+async def test_an_event_committed_while_a_socket_reads_comes_at_once(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    job = await studio.job()
+    plain, late = getattr(Repository, name), 3
+
+    async def read(*given: Any) -> Any:
+        nonlocal late
+        found = await plain(*given)
+        if late > 0:
+            late -= 1
+            await studio.note(job, "committed after the read, before its answer came")
+        return found
+
+    monkeypatch.setattr(Repository, name, read)
+    async with studio.connect(f"/jobs/{job}/events") as client:
+        await received(client, lambda event: event["seq"] == 1)
+        await studio.note(job)
+        assert seqs(await received(client, lambda event: event["seq"] == 5)) == [2, 3, 4, 5]
+
+
+async def test_a_socket_is_idle_while_nothing_happens(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = await studio.job()
+    reads = 0
+    plain = Repository.all_events_after
+
+    async def counted(*given: Any) -> Any:
+        nonlocal reads
+        reads += 1
+        return await plain(*given)
+
+    monkeypatch.setattr(Repository, "all_events_after", counted)
+    async with studio.connect(f"/jobs/{job}/events") as client:
+        await studio.note(job)
+        await received(client, lambda event: event["seq"] == 2)
+        await asyncio.sleep(0.1)
+    assert reads <= 3
 
 
 async def test_a_client_cut_off_at_random_points_misses_nothing(studio: Studio) -> None:

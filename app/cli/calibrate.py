@@ -1,0 +1,98 @@
+"""``lensmatch calibrate``: a lens table from a folder of pictures."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.bootstrap import utc_now
+from app.cli.alternating_set import calibrate_alternating
+from app.cli.console import Show, WorkFailed, check_out, print_json, progress_bar, reported_errors, say, write_file
+from app.cli.tables import show_table
+from app.documents import PictureSet, read_picture_set
+from app.jobs.cpu import Cpu
+from app.picture_sets import SetLevel, calibrate_set, table_of
+from app.report import picture_set_report, write_report
+from app.settings import default_cpu_workers
+from calibration.tables import LensTable, LevelResult
+from engine_adapters.folder import FolderPictures
+from storage.exports import EXPORTS
+from storage.schemas import table_to_document
+
+
+class Method(StrEnum):
+    """How a level is solved."""
+
+    JOINT = "joint"
+    ALTERNATING = "alternating"
+
+
+def calibrate(
+    picture_set: Annotated[Path, typer.Argument(metavar="PICTURE_SET", help="folder with a set.json")],
+    method: Annotated[
+        Method,
+        typer.Option(
+            help="joint: all pictures of a level at once. alternating: the study's, as a baseline; it needs the four "
+            "pictures center_shift, fov, k1, k2 of each level with camera and target poses"
+        ),
+    ] = Method.JOINT,
+    out: Annotated[Path | None, typer.Option(help="lens table (JSON) to write")] = None,
+    report: Annotated[Path | None, typer.Option(help="report (HTML) to write")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print the lens table as JSON on standard output")] = False,
+) -> None:
+    """Calibrate a lens from a folder of pictures, without an engine.
+
+    Prints each level with its sigmas and errors. Pictures of no use are left out with their reasons; a level with too
+    little left fails with its reason and the others go on.
+    """
+    with reported_errors():
+        check_out(out, report)
+        described = read_picture_set(picture_set)
+        folder = picture_set if picture_set.is_dir() else picture_set.parent
+        with progress_bar("calibrate") as show:
+            table, levels = asyncio.run(_calibrate(described, folder, method, show))
+        if out is not None:
+            write_file(out, EXPORTS["json"].write(table))
+        if report is not None:
+            facts = [("method", table.method), ("pictures", f"{len(described.pictures)}")]
+            write_report(report, picture_set_report(f"{table.lens} on {table.camera}", table, levels, facts))
+        if as_json:
+            print_json(table_to_document(table))
+        else:
+            show_table(table)
+        for path in (out, report):
+            if path is not None:
+                say(f"written: {path}")
+
+
+async def _calibrate(described: PictureSet, folder: Path, method: Method, show: Show) -> tuple[LensTable, list[SetLevel]]:
+    cpu = Cpu(default_cpu_workers())
+    try:
+        pictures = FolderPictures(folder)
+        if method is Method.JOINT:
+            levels = await calibrate_set(described, pictures, cpu, show)
+        else:
+            results = await calibrate_alternating(described, pictures, cpu, show)
+            levels = [SetLevel(result, None, ()) for result in results]
+    finally:
+        cpu.close()
+    if not any(_is_measured(level.result) for level in levels):
+        raise WorkFailed(_why_nothing(described, levels))
+    return replace(table_of(described, levels, utc_now()), method=method.value), levels
+
+
+def _is_measured(result: LevelResult) -> bool:
+    return result.fov_x_deg is not None
+
+
+def _why_nothing(described: PictureSet, levels: list[SetLevel]) -> str:
+    reasons = dict.fromkeys(level.result.reason or "unknown" for level in levels)
+    left_out = [f"{left.picture}: {left.reason}" for level in levels for left in level.result.left_out]
+    told = "; ".join(reasons)
+    more = f" (left out: {'; '.join(left_out[:3])}{' ...' if len(left_out) > 3 else ''})" if left_out else ""
+    return f"{described.lens}: no level could be measured: {told}{more}"
