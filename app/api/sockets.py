@@ -184,10 +184,10 @@ async def _send_events(socket: WebSocket, context: AppContext, follower: _Follow
     settings = context.settings
     if await follower.ended():
         return
+    over = False
     while True:
         # Cleared before reading: whatever is committed after the read wakes the wait below at once.
         wakeups.clear()
-        over = False
         for told in await follower.newer():
             await _send(socket, told.text, settings.send_timeout_s)
             follower.went_past(told.record)

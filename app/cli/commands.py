@@ -149,7 +149,7 @@ def _root(
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
     elif context.invoked_subcommand != "serve":
         # What goes wrong comes as one line at the end; the warnings on the way there would only double it.
-        logging.lastResort = None
+        logging.getLogger().addHandler(logging.NullHandler())
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
         raise typer.Exit(EXIT_USAGE)

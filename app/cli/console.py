@@ -128,7 +128,14 @@ def read_file(path: Path, limit_bytes: int) -> bytes:
 
 @contextlib.contextmanager
 def progress_bar(title: str) -> Iterator[Show]:
-    """A bar on standard error; the callable takes the share done (0..1) and what is being done."""
+    """A bar on standard error; the callable takes the share done (0..1) and what is being done.
+
+    Where nobody watches a terminal it is a line for each tenth.
+    """
+    if not messages.is_terminal:
+        with progress_lines(title, each=0.1) as show_line:
+            yield show_line
+        return
     columns = (
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=32),
@@ -136,7 +143,7 @@ def progress_bar(title: str) -> Iterator[Show]:
         TimeElapsedColumn(),
         TextColumn("[dim]{task.fields[doing]}"),
     )
-    with Progress(*columns, console=messages, transient=not messages.is_terminal) as progress:
+    with Progress(*columns, console=messages) as progress:
         task = progress.add_task(title, total=1.0, doing="")
 
         def show(share: float, doing: str) -> None:
@@ -146,15 +153,18 @@ def progress_bar(title: str) -> Iterator[Show]:
 
 
 @contextlib.contextmanager
-def progress_lines(title: str) -> Iterator[Show]:
-    """Progress as lines, one for each new thing that is done: where a person types in the same terminal, a bar that
-    redraws itself would garble what they type."""
-    last = ""
+def progress_lines(title: str, each: float | None = None) -> Iterator[Show]:
+    """Progress as lines: one for each new thing that is done, or, with ``each``, one whenever this share more is done.
+
+    Where a person types in the same terminal, a bar that redraws itself would garble what they type.
+    """
+    last: object = None
 
     def show(share: float, doing: str) -> None:
         nonlocal last
-        if doing != last:
-            last = doing
+        mark = doing if each is None else int(share / each + 1e-9)
+        if mark != last:
+            last = mark
             messages.print(f"[dim]{escape(title)} {share:4.0%}  {escape(doing)}[/]")
 
     yield show

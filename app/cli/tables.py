@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich import box
+from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
@@ -27,8 +28,9 @@ def plain_table(title: str, names: tuple[str, ...]) -> Table:
 
 def print_table(table: Table) -> None:
     """Print a table whole: where the terminal is narrower, its lines wrap instead of losing figures."""
-    wide = results.options.update(max_width=_WIDEST)
-    results.print(table, width=Measurement.get(results, wide, table).maximum)
+    wide = Console(width=_WIDEST)
+    natural = Measurement.get(wide, wide.options, table).maximum
+    Console(file=results.file, width=max(natural, results.width), highlight=False, soft_wrap=True).print(table)
 
 
 def show_table(table: LensTable) -> None:

@@ -30,7 +30,8 @@ def heat_map(map_px: FloatArray, image_size: tuple[int, int], end_px: float | No
     """The map (rows, columns) of px, first and last samples on the picture's outermost pixels, as a picture (BGR).
 
     Colours are viridis (readable without colour vision) from 0 to ``end_px``, else to :func:`scale_end_px` of the
-    largest finite value. NaN (no ray there) is grey, infinity (the lens folds there) red. A ring marks the largest value; the foot says it.
+    largest finite value. NaN (no ray there) is grey, infinity (the lens folds there) red. A ring marks the largest
+    value; the foot says it.
     """
     width, height = image_size
     map_height = max(round(_MAP_WIDTH * height / width), 120)

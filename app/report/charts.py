@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -150,7 +151,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 
 def _tick_text(value: float, values: Sequence[float]) -> str:
-    step = min((b - a for a, b in zip(values, values[1:], strict=False)), default=abs(value) or 1.0)
+    step = min((b - a for a, b in itertools.pairwise(values)), default=abs(value) or 1.0)
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
     if digits and abs(round(step, digits) - step) > 1e-9 * step:
         digits += 1  # steps of 2.5
@@ -184,7 +185,7 @@ def _text(x: float, y: float, text: str, anchor: str, kind: str = "tick") -> Mar
     return Markup('<text class="{}" x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(kind, x, y, anchor, text)
 
 
-def _path(points: Sequence[tuple[float, float]], x: _Axis, y: _Axis, kind: str, dash: Markup = Markup("")) -> Markup:
+def _path(points: Sequence[tuple[float, float]], x: _Axis, y: _Axis, kind: str, dash: str = "") -> Markup:
     steps = "L".join(f"{x.at(px):.1f} {y.at(py):.1f}" for px, py in points)
     return Markup('<path class="{}" d="M{}"{}/>').format(kind, steps, dash)
 

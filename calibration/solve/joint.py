@@ -25,16 +25,16 @@ from calibration.types import Detection, FloatArray, Refusal, Role, Target
 
 _PLACES: tuple[tuple[float, float, Role], ...] = (
     (1.0, 1.0, Role.K2),
-    (1.0, -1.0, Role.K2),
     (-1.0, -1.0, Role.K2),
+    (1.0, -1.0, Role.K2),
     (-1.0, 1.0, Role.K2),
     (-1.0, 0.0, Role.K1),
-    (0.0, 1.0, Role.FREE),
     (1.0, 0.0, Role.K1),
     (0.0, -1.0, Role.FREE),
+    (0.0, 1.0, Role.FREE),
 )
-# Round the picture, so that the head travels little.
-_FIRST_PLACE = (0.6, 0.4, Role.FOV)
+# Opposite corners first: they tell the bend and the centre apart with the fewest pictures.
+_FIRST_PLACE = (0.75, 0.75, Role.FOV)
 # Before the distortion is known, a target sent to the very corner may be bent out of the picture.
 _BEND_KNOWN_PX = 20.0
 # Expected overlay error below which a fit is good enough to aim with: about half the margin kept at the border.
@@ -50,9 +50,9 @@ class JointOptions:
     chosen for a level may take."""
 
     goal_px: float = 0.03
-    min_views: int = 6
+    min_views: int = 4
     max_views: int = 12
-    verify_views: int = 2
+    verify_views: int = 1
     margin: float = 0.02
     fill: float = 0.55
 
@@ -175,7 +175,7 @@ class JointMethod:
             return
         lens = self._lens()
         self._target = self._best_target(lens)
-        self._places = [*_PLACES] if self._task.guess is not None else [_FIRST_PLACE, *_PLACES]
+        self._places = [*_PLACES] if self._task.guess is not None else [_FIRST_PLACE, *_PLACES[1:], _PLACES[0]]
         if self._target != capture.target:
             self._places.insert(0, (0.0, 0.0, Role.CENTER_SHIFT))
         self._stage = _Stage.COLLECT
