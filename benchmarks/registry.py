@@ -1,7 +1,7 @@
 """The benchmarks by name, imported when one is run: each is a module with ``run`` and, if it has one, ``columns``.
 
-``run(*, quick, progress)`` gives rows, ``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs for
-the table that a person reads.
+``run(*, quick, progress)`` gives rows, ``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs
+for the table that a person reads.
 """
 
 from __future__ import annotations

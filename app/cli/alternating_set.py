@@ -1,8 +1,8 @@
 """The study's alternating method on a folder of pictures, without an engine.
 
-The method asks for a camera picture at a place (centre, side, edge, corner): it gets the set's picture of that role with
-the pose that stands in the set. It asks for the engine's render of the same view with trial values: it gets the target
-projected through the product's own lens model at that pose, as an engine with exactly this model would show it.
+The method asks for a camera picture at a place (centre, side, edge, corner): it gets the set's picture of that role,
+with the pose that stands in the set. It asks for the engine's render of the same view with trial values: it gets the
+target projected through the product's own lens model at that pose, as an engine with exactly this model shows it.
 """
 
 from __future__ import annotations

@@ -70,7 +70,9 @@ def calibrate(
                 say(f"written: {path}")
 
 
-async def _calibrate(described: PictureSet, folder: Path, method: Method, show: Show) -> tuple[LensTable, list[SetLevel]]:
+async def _calibrate(
+    described: PictureSet, folder: Path, method: Method, show: Show
+) -> tuple[LensTable, list[SetLevel]]:
     cpu = Cpu(default_cpu_workers())
     try:
         pictures = FolderPictures(folder)

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 from typer.core import TyperGroup
 
 from app.cli.bench import bench
@@ -33,10 +34,18 @@ _INTERRUPTED = 130
 class OneLineErrors(TyperGroup):
     """Wrong usage in one line instead of a box, with the exit codes of :mod:`app.cli.console`."""
 
-    def main(self, args: Sequence[str] | None = None, *given: Any, standalone_mode: bool = True, **extra: Any) -> Any:
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
         """Run; exits with the command's code (standalone) or gives it back."""
         try:
-            code = super().main(args, *given, standalone_mode=False, **extra)
+            code = super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
         except Exception as error:
             # What the parser raises has these two, whichever parser this version of typer brings along.
             if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
@@ -44,17 +53,13 @@ class OneLineErrors(TyperGroup):
             context = getattr(error, "ctx", None)
             command = context.command_path if context is not None else "lensmatch"
             told = " ".join(str(error.format_message()).split()).rstrip(".")
-            messages.print(f"[bold red]error:[/] {_escape(told)}; see {_escape(command)} --help")
+            messages.print(f"[bold red]error:[/] {escape(told)}; see {escape(command)} --help")
             code = EXIT_USAGE
         if code == _INTERRUPTED:
             code = EXIT_FAILED
         if standalone_mode:
             sys.exit(code or 0)
         return code
-
-
-def _escape(text: str) -> str:
-    return text.replace("[", "\\[")
 
 
 cli = typer.Typer(
@@ -70,7 +75,9 @@ def _examples(*lines: str) -> str:
     return "\n\n".join(("[dim]Examples:[/]", *lines))
 
 
-cli.command(rich_help_panel=_CALIBRATE, epilog=_examples("lensmatch demo", "lensmatch demo --zooms 2 --focuses 1"))(demo)
+cli.command(rich_help_panel=_CALIBRATE, epilog=_examples("lensmatch demo", "lensmatch demo --zooms 2 --focuses 1"))(
+    demo
+)
 cli.command(
     rich_help_panel=_CALIBRATE,
     epilog=_examples("lensmatch calibrate FOLDER --out table.json", "lensmatch calibrate FOLDER --method alternating"),
@@ -136,7 +143,9 @@ def _print_version(wanted: bool) -> None:
 @cli.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="show what the parts log, on standard error")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="show what the parts log, on standard error")
+    ] = False,
     show_version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and stop")
     ] = False,

@@ -175,7 +175,7 @@ def _show(judged: list[Judged], use: StudioUse, seconds: float, out: Path) -> No
         pad_edge=False,
         padding=(0, 1),
     )
-    for name in ("zoom", "focus", "FoV x deg", "k1_hw", "k2_hw", "shift x", "y px", "pics", "off by px"):
+    for name in ("zoom", "focus", "FoV deg", "k1_hw", "k2_hw", "shift x", "y px", "pics", "off px"):
         table.add_column(name, justify="right", no_wrap=True)
     for j in judged:
         _add_rows(table, j)

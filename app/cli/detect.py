@@ -7,13 +7,14 @@ import math
 import re
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 import typer
 
 from app.cli.console import EXIT_FAILED, check_out, fail, print_json, reported_errors, results, write_file, wrong_usage
 from app.cli.tables import plain_table, print_table
+from app.documents import DocumentError
 from calibration.detect.target import find_target
 from calibration.errors import CalibrationError, InvalidInput
 from calibration.image import Transfer, decode_picture
@@ -45,9 +46,9 @@ def detect(
     with reported_errors():
         check_out(picture_out)
         try:
-            pixels = asyncio.run(_read(picture))
-        except (AdapterError, CalibrationError) as error:
-            _not_found(f"{picture}: {_without_file(str(error), picture)}", as_json)
+            pixels = _read(picture)
+        except DocumentError as error:
+            _not_found(str(error), as_json)
         started = time.perf_counter()
         found = find_target(pixels, wanted, transfer=light)
         seconds = time.perf_counter() - started
@@ -75,17 +76,17 @@ def _target(spec: str) -> Target:
     wrong_usage(f"--target {spec}: write chessboard:COLSxROWS (squares), as in chessboard:10x7, or square, or light")
 
 
-async def _read(path: Path) -> Picture:
+def _read(path: Path) -> Picture:
     whole = path.resolve()
-    frame = await FolderPictures(whole.parent).read(whole.name)
-    return decode_picture(frame.data)
+    try:
+        frame = asyncio.run(FolderPictures(whole.parent).read(whole.name))
+        return decode_picture(frame.data)
+    except (AdapterError, CalibrationError) as error:
+        told = str(error).removeprefix(f"{whole.name}: ").removeprefix(f"{whole.parent}: ")
+        raise DocumentError(f"{path}: {told}") from error
 
 
-def _without_file(message: str, path: Path) -> str:
-    return message.removeprefix(f"{path.resolve().name}: ").removeprefix(f"{path.resolve().parent}: ")
-
-
-def _not_found(reason: str, as_json: bool) -> None:
+def _not_found(reason: str, as_json: bool) -> NoReturn:
     if as_json:
         print_json({"found": False, "reason": reason})
         raise typer.Exit(EXIT_FAILED)

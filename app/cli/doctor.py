@@ -211,7 +211,8 @@ async def _workers(settings: Settings, cpu: Cpu) -> str:
 
 async def _profile(profile: StudioProfile, source: str) -> str:
     make_studio(profile)
-    return f"{source}: scene {profile.r3.scene!r}, pictures {profile.picture.image_size[0]}x{profile.picture.image_size[1]}"
+    width, height = profile.picture.image_size
+    return f"{source}: scene {profile.r3.scene!r}, pictures {width}x{height}"
 
 
 async def _engine(studio: Studio, profile: StudioProfile) -> str:

@@ -76,7 +76,9 @@ def answered(line: str, question: str, last: dict[str, float]) -> dict[str, floa
     else:
         return f"{line!r} is not understood. {_HOW}"
     missing = [name for name in _NAMES if name not in known]
-    return known if not missing else f"{', '.join(missing)} not known yet: give all five numbers once: {' '.join(_NAMES)}"
+    return (
+        known if not missing else f"{', '.join(missing)} not known yet: give all five numbers once: {' '.join(_NAMES)}"
+    )
 
 
 def has_terminal() -> bool:

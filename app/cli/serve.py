@@ -41,7 +41,7 @@ class _Server(uvicorn.Server):
             self._ready()
 
     @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:  # type: ignore[override]
+    def capture_signals(self) -> Iterator[None]:
         yield
 
 
@@ -137,7 +137,9 @@ def _stopped_by_signals(server: _Server) -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         server.handle_exit(number, frame)
 
-    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGBREAK] if sys.platform == "win32" else [])]
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if sys.platform == "win32":
+        numbers.append(signal.SIGBREAK)
     before: dict[signal.Signals, Any] = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield

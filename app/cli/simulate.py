@@ -42,7 +42,9 @@ def simulate(
     payload_format: Annotated[PictureFormat, typer.Option(help="its picture file")] = _DEFAULT.payload_format,
     head_speed: Annotated[float, typer.Option(min=0, help="of the head, degrees a second")] = _DEFAULT.head_speed_deg_s,
     seed: Annotated[int, typer.Option(min=0, help="of the noise")] = _DEFAULT.seed,
-    exit_with_parent: Annotated[bool, typer.Option("--exit-with-parent", help="end when standard input closes")] = False,
+    exit_with_parent: Annotated[
+        bool, typer.Option("--exit-with-parent", help="end when standard input closes")
+    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="as every command has it; the addresses are JSON either way")
     ] = False,

@@ -36,7 +36,7 @@ def print_table(table: Table) -> None:
 def show_table(table: LensTable) -> None:
     """Print the levels; reasons and pictures left out go to standard error, one line each."""
     grid = plain_table(
-        f"{table.lens} on {table.camera}, {table.method}; each value with its sigma below; errors in px",
+        f"{table.lens} on {table.camera}, {table.method}; each value with its sigma below; errors RMS, px",
         ("zoom", "focus", "", "FoV x deg", "k1", "k2", "shift x", "y px", "residual", "held out", "expected", "pics"),
     )
     for level in table.levels:
@@ -77,7 +77,7 @@ def _add_level(grid: Table, level: LevelResult) -> None:
     values = (sigma.fov_x_deg, sigma.k1, sigma.k2, *shift_sigma)
     digits = (4, 5, 5, 3, 3)
     told = ["" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]
-    grid.add_row("", "", "", *told, "rms", "rms", "rms", "", style="dim")
+    grid.add_row("", "", "", *told, style="dim")
 
 
 def _tell_reasons(level: LevelResult) -> None:

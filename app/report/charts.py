@@ -114,6 +114,7 @@ def _axes(points: Sequence[tuple[float, float]], chart: Chart) -> tuple[_Axis, _
     y_low, y_high = _span(ys, from_zero=chart.from_zero)
     if chart.equal:
         per_px = max((x_high - x_low) / (WIDTH - LEFT - RIGHT), (y_high - y_low) / (HEIGHT - TOP - BOTTOM))
+        per_px *= 1.2  # room for the words at its ends
         x_half, y_half = per_px * (WIDTH - LEFT - RIGHT) / 2, per_px * (HEIGHT - TOP - BOTTOM) / 2
         x_mid, y_mid = (x_low + x_high) / 2, (y_low + y_high) / 2
         # Image coordinates: v grows downwards on the page as it does in the picture.

@@ -27,7 +27,8 @@ OfLens = Callable[[Lens], float]
 class Figure:
     """A drawn chart with its caption; ``legend``: (mark, name) of each series."""
 
-    caption: str
+    title: str
+    remark: str
     svg: Markup
     legend: tuple[tuple[Markup, str], ...]
 
@@ -127,7 +128,7 @@ def _shift_path(report: RunReport, groups: Groups) -> Figure:
             labels = [(*shift, f"zoom {encoder(zoom)}") for zoom, shift in (path[0], path[-1])]
     faint = [[lens.center_shift_px for _, lens in curve] for curve in _truth_curves(report, groups)]
     chart = Chart("Centre shift", "to the right, px", "down, px", series, faint, labels, equal=True)
-    return _figure(chart, "path of the principal point from wide to tele, same scale on both axes")
+    return _figure(chart, "the principal point's path from wide to tele")
 
 
 def _overlay_errors(report: RunReport, groups: Groups) -> Figure:
@@ -155,7 +156,7 @@ def _overlay_errors(report: RunReport, groups: Groups) -> Figure:
             hollow=True,
         ),
     ]
-    return _errors("Overlay error", "the largest anywhere in the picture", "largest overlay error, px", series)
+    return _errors("Overlay error", "largest anywhere in the picture", "largest overlay error, px", series)
 
 
 def _true_max(level: LevelReport) -> float | None:
@@ -179,7 +180,7 @@ def _pulls(groups: Groups) -> Figure:
         bands=(-2, -1, 1, 2),
         from_zero=False,
     )
-    return _figure(chart, "two in three should lie within 1, nineteen in twenty within 2")
+    return _figure(chart, "two in three should lie within 1")
 
 
 def _residuals(groups: Groups) -> Figure:
@@ -240,5 +241,4 @@ def _figure(chart: Chart, remark: str = "") -> Figure:
                 "truth",
             )
         )
-    caption = f"{chart.title}: {remark}" if remark else chart.title
-    return Figure(caption, draw(chart), tuple(legend))
+    return Figure(chart.title, remark, draw(chart), tuple(legend))
