@@ -284,14 +284,14 @@ def parse(record: EventRecord) -> AnyEvent:
 
 def message(record: EventRecord) -> dict[str, Any]:
     """The stored event as clients get it; kinds that this version does not know pass through."""
-    return {
-        **record.data,
+    envelope = {
         "seq": record.seq,
         "at": format_utc(record.at),
         "kind": record.kind,
         "job_id": record.job_id,
         "number": record.number,
     }
+    return {**envelope, **record.data, **envelope}  # it comes first, and no field of a kind replaces it
 
 
 def schema_text() -> str:

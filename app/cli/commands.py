@@ -156,7 +156,7 @@ def _root(
     """
     if verbose:
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
-    elif context.invoked_subcommand != "serve":
+    elif context.invoked_subcommand != "serve" and not logging.getLogger().handlers:
         # What goes wrong comes as one line at the end; the warnings on the way there would only double it.
         logging.getLogger().addHandler(logging.NullHandler())
     if context.invoked_subcommand is None:

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.types import FloatArray, Picture
 
 _MAP_WIDTH = 960
-_BAR_WIDTH, _BAR_GAP, _LABELS_WIDTH = 26, 24, 124
+_BAR_WIDTH, _BAR_GAP, _LABELS_WIDTH = 26, 24, 148
 _MARGIN, _FOOT = 12, 52
 _STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _PAPER, _INK = (255, 255, 255), (58, 48, 42)
@@ -72,7 +72,7 @@ def _bar(canvas: Picture, end: float, map_height: int) -> None:
     for share in (0.0, 0.5, 1.0):
         y = _MARGIN + round((1 - share) * (map_height - 1))
         cv2.line(canvas, (left + _BAR_WIDTH, y), (left + _BAR_WIDTH + 6, y), _INK, 1, cv2.LINE_AA)
-        baseline = min(max(y + 8, _MARGIN + 18), _MARGIN + map_height)
+        baseline = min(max(y + 9, _MARGIN + 21), _MARGIN + map_height)
         text = "0" if share == 0 else f"{share * end:.3g} px"
         _text(canvas, text, (left + _BAR_WIDTH + 12, baseline))
 
@@ -102,4 +102,4 @@ def _digits(value: float) -> str:
 
 
 def _text(canvas: Picture, text: str, at: tuple[int, int]) -> None:
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.75, _INK, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.9, _INK, 1, cv2.LINE_AA)

@@ -24,7 +24,8 @@ _JPEG_QUALITY = 90
 _CAMERA, _ENGINE = (233, 200, 70), (30, 120, 255)
 # Light blue and orange are told apart without colour vision too.
 _WHITE, _INK, _ARROW = (255, 255, 255), (24, 24, 24), (60, 60, 200)
-_INSET_ZOOM, _INSET_HALF = 14, 16
+_INSET_HALF, _INSET_SHARE = 16, 0.23
+# Half the width of what the inset shows, px, and how much of the picture's width it takes.
 _ARROW_PX = 14.0
 _FAR_PX = 1e4
 # Beyond this OpenCV's fixed-point coordinates would wrap round.
@@ -103,7 +104,7 @@ def overlay_picture(real: SeenPicture, drawn_px: FloatArray, grid: tuple[int, in
     """The camera's picture, darkened, with the corners it shows (rings) and the engine's (grid of lines).
 
     ``drawn_px``: the engine's (N, 2), row by row of the target's ``grid`` (columns, rows), NaN where unknown. The foot
-    says how far they are apart at most; an inset shows the surroundings of that corner fourteen times larger.
+    says how far they are apart at most; an inset shows the surroundings of that corner enlarged.
     """
     canvas = _darkened(real.picture)
     found_px = np.full_like(drawn_px, np.nan)
@@ -118,7 +119,7 @@ def overlay_picture(real: SeenPicture, drawn_px: FloatArray, grid: tuple[int, in
         return _with_foot(canvas, f"{title}: the target is not in the picture")
     worst = int(np.nanargmax(distance))
     if distance[worst] < _INSET_HALF:
-        _inset(canvas, real.picture, found_px[worst], drawn_px[worst])
+        _inset(canvas, real.picture, found_px, drawn_px, worst)
     far = float(distance[worst])
     return _with_foot(
         canvas, f"{title}: at most {far:.3f} px apart" if far < 1 else f"{title}: up to {far:.1f} px apart"
@@ -192,32 +193,44 @@ def _cross(canvas: Picture, u: float, v: float, size: int, colour: tuple[int, in
         cv2.line(canvas, (x - dx, y - dy), (x + dx, y + dy), colour, thickness, cv2.LINE_AA, 4)
 
 
-def _inset(canvas: Picture, picture: Picture, found: FloatArray, drawn: FloatArray) -> None:
+def _inset(canvas: Picture, picture: Picture, found_px: FloatArray, drawn_px: FloatArray, index: int) -> None:
     height, width = picture.shape[:2]
-    half, side = _INSET_HALF, 2 * _INSET_HALF * _INSET_ZOOM
-    if width < 2 * side or height < 2 * side:
+    half = _INSET_HALF
+    zoom = round(_INSET_SHARE * width / (2 * half))
+    side = 2 * half * zoom
+    if zoom < 4 or height < 2 * side:
         return
-    u = int(np.clip(round(float(found[0])), half, width - half - 1))
-    v = int(np.clip(round(float(found[1])), half, height - half - 1))
-    crop = picture[v - half : v + half, u - half : u + half]
-    large: NDArray[np.uint8] = np.asarray(
-        cv2.resize(_darkened(np.ascontiguousarray(crop)), (side, side), interpolation=cv2.INTER_NEAREST), dtype=np.uint8
-    )
-    for (x, y), is_camera in ((found, True), (drawn, False)):
+    u = int(np.clip(round(float(found_px[index, 0])), half, width - half - 1))
+    v = int(np.clip(round(float(found_px[index, 1])), half, height - half - 1))
+    crop = np.ascontiguousarray(picture[v - half : v + half, u - half : u + half])
+    enlarged = cv2.resize(_darkened(crop), (side, side), interpolation=cv2.INTER_NEAREST)
+    large: NDArray[np.uint8] = np.asarray(enlarged, dtype=np.uint8)
+    for (x, y), is_camera in ((found_px[index], True), (drawn_px[index], False)):
         # The middle of a pixel is half an enlarged pixel in.
-        at = [(float(value) - (middle - half) + 0.5) * _INSET_ZOOM - 0.5 for value, middle in ((x, u), (y, v))]
+        at = [(float(value) - (middle - half) + 0.5) * zoom - 0.5 for value, middle in ((x, u), (y, v))]
         if is_camera:
-            _ring(large, at[0], at[1], 36.0, _CAMERA, 5)
+            _ring(large, at[0], at[1], 2.6 * zoom, _CAMERA, 5)
         else:
-            _cross(large, at[0], at[1], 110, _ENGINE, 3)
-    # Put where the corner is not.
-    top = 24 if v > height / 2 else height - side - 24
-    left = 24 if u > width / 2 else width - side - 24
+            _cross(large, at[0], at[1], 8 * zoom, _ENGINE, 3)
+    left, top = _free_corner(np.concatenate([found_px, drawn_px]), (width, height), side)
     canvas[top : top + side, left : left + side] = large
     cv2.rectangle(canvas, (left - 1, top - 1), (left + side, top + side), _WHITE, 2)
     cv2.rectangle(canvas, (u - half, v - half), (u + half, v + half), _WHITE, 2)
-    label = f"{_INSET_ZOOM} x, the corner farthest off"
-    cv2.putText(canvas, label, (left + 14, top + side - 16), cv2.FONT_HERSHEY_SIMPLEX, 1.0, _WHITE, 2, cv2.LINE_AA)
+    label, size = f"{zoom} x, the corner farthest off", zoom / 14
+    cv2.putText(canvas, label, (left + zoom, top + side - zoom), cv2.FONT_HERSHEY_SIMPLEX, size, _WHITE, 2, cv2.LINE_AA)
+
+
+def _free_corner(points_px: FloatArray, size: tuple[int, int], side: int) -> tuple[int, int]:
+    """(left, top) of a square of ``side`` px in that corner of the picture where it hides the fewest points."""
+    margin = 24
+    far_left, far_top = size[0] - side - margin, size[1] - side - margin
+    places = [(far_left, far_top), (margin, far_top), (far_left, margin), (margin, margin)]
+
+    def hidden(place: tuple[int, int]) -> int:
+        inside = (points_px > np.array(place) - margin) & (points_px < np.array(place) + side + margin)
+        return int(np.count_nonzero(inside.all(axis=1)))
+
+    return min(places, key=hidden)
 
 
 def _with_foot(canvas: Picture, text: str) -> Picture:

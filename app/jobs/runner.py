@@ -35,7 +35,7 @@ from app.jobs.cpu import Cpu
 from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
 from app.jobs.state import sources
-from app.jobs.sweep import guess_from, level_task, order
+from app.jobs.sweep import level_task, order
 from app.jobs.taking import PictureTaker
 from calibration.compare import Overlay, predicted_overlay
 from calibration.errors import CalibrationError
@@ -270,7 +270,7 @@ class JobRunner:
         failures = 0
         for ordinal, (zoom, focus) in enumerate(ordered):
             await self._event(job_id, LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus))
-            task = level_task(request, zoom, focus, guess_from(results, zoom, request))
+            task = level_task(request, zoom, focus, results)
             method = make_method(request, task)
             outcome, problem = await self._level(job_id, ordinal, method, task, taker, lease)
             results.append(outcome.result)

@@ -9,6 +9,9 @@ from calibration.lens import Lens
 from calibration.solve.search import LevelTask
 from calibration.tables import LevelResult, LevelStatus
 
+_NODAL_CHANGE_MM = 100.0
+# How much the pupil of a zoom lens moves between neighbouring levels, generously.
+
 
 def order(levels: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Zoom by zoom, the focuses there and back again, so that the lens travels little."""
@@ -33,8 +36,19 @@ def guess_from(done: Iterable[LevelResult], zoom: float, request: JobRequest) ->
     return None
 
 
-def level_task(request: JobRequest, zoom: float, focus: float, guess: Lens | None) -> LevelTask:
-    """What a method must know of one level of a job."""
+def last_measured(done: Sequence[LevelResult], request: JobRequest) -> Lens | None:
+    """The lens of the level measured last, or None."""
+    measured = [result for result in done if result.fov_x_deg is not None]
+    return measured[-1].lens(request.image_size, request.pixel_aspect) if measured else None
+
+
+def level_task(request: JobRequest, zoom: float, focus: float, done: Sequence[LevelResult]) -> LevelTask:
+    """What a method must know of one level of a job, after the levels ``done``.
+
+    Once a level has shown that the pupil is not at the pivot, no later one may take it to be there: the nodal offset
+    then starts from the nearest level's, as a prior.
+    """
+    nodal = [result.nodal_offset_mm for result in done if result.nodal_offset_mm is not None]
     return LevelTask(
         zoom=zoom,
         focus=focus,
@@ -44,5 +58,8 @@ def level_task(request: JobRequest, zoom: float, focus: float, guess: Lens | Non
         pixel_aspect=request.pixel_aspect,
         pivot_sigma_m=request.pivot_sigma_m,
         angle_sigma_deg=request.angle_sigma_deg,
-        guess=guess,
+        nodal_offset_mm=nodal[-1] if nodal else 0.0,
+        nodal_sigma_mm=_NODAL_CHANGE_MM if nodal else 0.0,
+        guess=guess_from(done, zoom, request),
+        neighbour=last_measured(done, request),
     )

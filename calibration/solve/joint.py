@@ -38,6 +38,8 @@ _FIRST_PLACE = (0.75, 0.75, Role.FOV)
 # Before the distortion is known, a target sent to the very corner may be bent out of the picture.
 _BEND_KNOWN_PX = 20.0
 # Expected overlay error below which a fit is good enough to aim with: about half the margin kept at the border.
+_PROBE_OFF_OF_WIDTH = 0.15
+# A target aimed at stands in the middle but for the centre shift and the survey's error; farther off it is another.
 _FIRST_GUESS_FOV_DEG = 40.0
 # Only aims the head at a target in the middle, which hardly depends on it.
 
@@ -143,12 +145,17 @@ class JointMethod:
     # --- probing: which target, and roughly which focal length ---
 
     def _probe_order(self) -> list[str]:
+        """The target that should fill the picture best first, then smaller ones (the view may be narrower), then the
+        rest; without any idea of the view, as they were surveyed."""
         names = list(self._task.targets)
-        guess = self._task.guess
-        if guess is None:
+        near = self._task.guess or self._task.neighbour
+        if near is None:
             return names
-        best = self._best_target(guess)
-        return [best, *(name for name in names if name != best)]
+        best = self._best_target(near)
+        share = {name: self._share(near, self._task.targets[name]) for name in names}
+        smaller = sorted((n for n in names if share[n] < share[best]), key=share.__getitem__, reverse=True)
+        larger = sorted((n for n in names if n != best and share[n] >= share[best]), key=share.__getitem__)
+        return [best, *smaller, *larger]
 
     def _ask_probe(self) -> Capture | None:
         if not self._probes:
@@ -165,6 +172,14 @@ class JointMethod:
     def _tell_probe(self, capture: Capture, observation: Observation) -> None:
         if isinstance(observation.result, Refusal):
             self._left_out.append(LeftOut(_name(capture, observation), observation.result.reason))
+            return
+        middle = (np.asarray(self._task.image_size) - 1) / 2
+        off_px = float(np.linalg.norm(observation.result.centre_px - middle))
+        if off_px > _PROBE_OFF_OF_WIDTH * self._task.image_size[0]:
+            reason = (
+                f"what was found stands {off_px:.0f} px from where the target should: another one, or a wrong survey"
+            )
+            self._left_out.append(LeftOut(_name(capture, observation), reason))
             return
         self._add_view(capture, observation, observation.result)
         try:
@@ -343,6 +358,7 @@ class JointMethod:
             self._task.image_size,
             pixel_aspect=self._task.pixel_aspect,
             nodal_offset_mm=self._task.nodal_offset_mm,
+            nodal_sigma_mm=self._task.nodal_sigma_mm,
         )
 
     def _lens(self) -> Lens:

@@ -21,6 +21,7 @@ from calibration.solve.problem import (
     LENS_COUNT,
     PRIOR_K1_HW,
     PRIOR_K2_HW,
+    PRIOR_NODAL_MM,
     PRIOR_SHIFT_OF_WIDTH,
     Evaluation,
     Problem,
@@ -106,11 +107,14 @@ def solve_level(
     *,
     pixel_aspect: float = 1.0,
     nodal_offset_mm: float = 0.0,
+    nodal_sigma_mm: float = 0.0,
     guess: Lens | None = None,
 ) -> LevelFit:
     """Fit one lens to all pictures of a level. Raises :class:`calibration.errors.CalibrationError`.
 
-    ``guess`` is a lens to start from; without one the start is found from the pictures alone.
+    ``nodal_offset_mm`` stands unless the pictures contradict it; with a ``nodal_sigma_mm`` it is only a prior, and what
+    the pictures and the prior leave open shows in the covariance. ``guess`` is a lens to start from; without one the
+    start is found from the pictures alone.
     """
     if not views:
         raise NotEnoughData("no picture of this level shows its target")
@@ -121,7 +125,7 @@ def solve_level(
     while True:
         _require_enough(kept)
         lens, poses = start(kept, image_size, pixel_aspect, nodal_offset_mm, guess)
-        fitted = _Fit(kept, lens, poses)
+        fitted = _Fit(kept, lens, poses, nodal_sigma_mm=nodal_sigma_mm or PRIOR_NODAL_MM)
         fitted.run()
         bad = fitted.worst_view()
         if bad is None or len(kept) <= 2:
@@ -134,7 +138,7 @@ def solve_level(
     seen = None if fit.sigma_nodal_mm is None else (fit.lens.nodal_offset_mm, fit.sigma_nodal_mm)
     nodal_told = False
     if seen is not None:
-        nodal_told = abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
+        nodal_told = nodal_sigma_mm > 0 or abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
         if not nodal_told:
             # What contradicts nothing stays as given: left free, it would only take exactness from the field of view.
             given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
@@ -224,8 +228,9 @@ class _Fit:
         *,
         lens_free: bool = True,
         held: tuple[str, ...] = (),
+        nodal_sigma_mm: float = PRIOR_NODAL_MM,
     ) -> None:
-        self.problem = Problem(views, lens, poses, lens_free=lens_free, held=held)
+        self.problem = Problem(views, lens, poses, lens_free=lens_free, held=held, nodal_sigma_mm=nodal_sigma_mm)
         self.state: State = self.problem.state
         self.detector_px2 = np.concatenate([v.detection.covariance_px2 for v in views])
         self.used = np.ones(len(self.detector_px2), dtype=bool)

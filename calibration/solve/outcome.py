@@ -15,6 +15,8 @@ from calibration.types import FloatArray
 USABLE_OVERLAY_PX = 1.0
 """Expected overlay error above which a level is called degraded: a shift that a viewer begins to see."""
 
+_NODAL_LOOSE_MM = 2.0
+# A nodal offset less certain than this is what most of a large expected error comes from.
 _NODAL_HINT = 3.0
 # Sigmas of the nodal offset at which a level is called degraded before it is certain enough to be used.
 
@@ -94,9 +96,13 @@ def _outliers(fit: LevelFit) -> list[LeftOut]:
 def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -> list[str]:
     trouble: list[str] = []
     if not math.isfinite(expected_max_px) or expected_max_px > USABLE_OVERLAY_PX:
-        trouble.append(
-            f"expected overlay error up to {expected_max_px:.1f} px: take more pictures, the target nearer the corners"
-        )
+        advice = "take more pictures, the target nearer the corners"
+        if fit.nodal_told and fit.sigma_nodal_mm is not None and fit.sigma_nodal_mm > _NODAL_LOOSE_MM:
+            advice = (
+                f"the nodal offset is known to {fit.sigma_nodal_mm:.0f} mm only and shows as field of view: add a target "
+                "at another distance"
+            )
+        trouble.append(f"expected overlay error up to {expected_max_px:.1f} px: {advice}")
     if fit.untold:
         trouble.append(f"not told by the pictures: {', '.join(fit.untold)}")
     if fit.nodal_seen_mm is not None and not fit.nodal_told:

@@ -138,8 +138,9 @@ class Problem:
     """A level's views with their unknowns.
 
     ``lens_free`` False keeps the lens as it is (only poses move); ``held`` names lens quantities (``k1``, ``k2``,
-    ``center_shift_px``) to be kept at 0, or ``nodal_offset_mm`` to be kept as it is. The nodal offset is an unknown
-    wherever posed pictures could tell it: taken as known, its error would hide in the field of view.
+    ``center_shift_px``) to be kept at 0, or ``nodal_offset_mm`` to be kept as it is. The nodal offset, with the prior
+    ``nodal_sigma_mm``, is an unknown wherever posed pictures could tell it: taken as known, its error would hide in
+    the field of view.
     """
 
     def __init__(
@@ -150,8 +151,10 @@ class Problem:
         *,
         lens_free: bool = True,
         held: tuple[str, ...] = (),
+        nodal_sigma_mm: float = PRIOR_NODAL_MM,
     ) -> None:
         self.views = tuple(views)
+        self._nodal_sigma_mm = nodal_sigma_mm
         shift_px = _HELD if "center_shift_px" in held else PRIOR_SHIFT_OF_WIDTH * lens.image_size[0]
         self._prior_sigmas = (
             _HELD if "k1" in held else PRIOR_K1_HW,
@@ -293,8 +296,8 @@ class Problem:
                 residual.append(value / sigma)
                 columns.append((column, 1 / sigma))
         if self.nodal_free:
-            residual.append((state.lens.nodal_offset_mm - self.nodal_prior_mm) / PRIOR_NODAL_MM)
-            columns.append((self.nodal_column, 1 / PRIOR_NODAL_MM))
+            residual.append((state.lens.nodal_offset_mm - self.nodal_prior_mm) / self._nodal_sigma_mm)
+            columns.append((self.nodal_column, 1 / self._nodal_sigma_mm))
         for place in (*state.pivots.values(), *state.target_places.values()):
             residual += list((place.value_m - place.prior_m) / place.sigma_m)
             columns += [(place.start + i, 1 / place.sigma_m) for i in range(3)]

@@ -72,7 +72,9 @@ class LevelTask:
     """What a method must know before it starts: one zoom and focus, the surveyed room, the picture.
 
     ``targets`` are posed, by name; ``pivot_m`` where the camera turns (``pivot_sigma_m``: its survey);
-    ``angle_sigma_deg`` the head's encoders; ``guess`` the lens of a level nearby, or None. ``pan_range_deg`` and
+    ``angle_sigma_deg`` the head's encoders; ``nodal_offset_mm`` stands unless the pictures contradict it, with a
+    ``nodal_sigma_mm`` it is a prior; ``guess`` the lens of a level that differs little (another focus), or None;
+    ``neighbour`` that of the level measured before, which only says what to look at first. ``pan_range_deg`` and
     ``tilt_range_deg`` bound the head.
     """
 
@@ -85,7 +87,9 @@ class LevelTask:
     pivot_sigma_m: float = 0.0
     angle_sigma_deg: float = 0.0
     nodal_offset_mm: float = 0.0
+    nodal_sigma_mm: float = 0.0
     guess: Lens | None = None
+    neighbour: Lens | None = None
     pan_range_deg: tuple[float, float] = (-90.0, 90.0)
     tilt_range_deg: tuple[float, float] = (-45.0, 45.0)
 

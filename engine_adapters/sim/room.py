@@ -141,8 +141,12 @@ class Room:
 
 
 def build_room(kind: RoomKind = RoomKind.BOARDS) -> Room:
-    """The demo studio with its boards, or with plain red squares, or with boards and a phone's light."""
-    large, small = (-0.6, 5.0, 1.6), (0.35, 5.0, 1.6)
+    """The demo studio with its boards, or with plain red squares, or with boards and a phone's light.
+
+    The boards' sizes stand to each other as a 20x zoom needs: there is always one that fills the picture well.
+    """
+    large, small, tiny = (-0.6, 5.0, 1.6), (0.35, 5.0, 1.6), (0.06, 5.0, 1.6)
+    panels: tuple[Panel, ...]
     if kind is RoomKind.SQUARE:
         panels = (
             Panel("square_large", (1, 1), (0.6, 0.6), (_RED, _RED), large),
@@ -152,6 +156,7 @@ def build_room(kind: RoomKind = RoomKind.BOARDS) -> Room:
         panels = (
             Panel("board_large", (9, 7), (0.1, 0.1), (_RED, _WHITE), large, margin_m=0.04),
             Panel("board_small", (8, 6), (0.03, 0.03), (_RED, _BLACK), small, margin_m=0.015),
+            Panel("board_tiny", (7, 5), (0.008, 0.008), (_RED, _WHITE), tiny, margin_m=0.004),
         )
     lamps = (Lamp("light", (0.0, 5.0, 1.6), 0.01),) if kind is RoomKind.LIGHT else ()
     return Room(kind, panels, lamps, tuple(_backdrop(panels)))

@@ -71,7 +71,7 @@ def test_a_message_is_flat_and_has_its_envelope(event: events.AnyEvent) -> None:
     sent = events.message(record(event))
     assert (sent["seq"], sent["number"], sent["job_id"], sent["kind"]) == (3, 9, "a-job", event.kind)
     assert sent["at"] == "2026-11-21T10:00:00Z"
-    assert set(events.EventMessage.model_fields) <= set(sent)
+    assert list(sent)[:5] == ["seq", "at", "kind", "job_id", "number"]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
@@ -110,6 +110,8 @@ def test_a_wrong_event_is_refused(kind: str, data: dict[str, object]) -> None:
 def test_events_of_a_newer_version_pass_through_to_clients() -> None:
     newer = EventRecord(1, "a-job", 1, AT, "lens_polished", {"cloth": "soft"})
     assert events.message(newer)["cloth"] == "soft"
+    imitating = EventRecord(1, "a-job", 1, AT, "lens_polished", {"seq": 99, "job_id": "another"})
+    assert (events.message(imitating)["seq"], events.message(imitating)["job_id"]) == (1, "a-job")
     with pytest.raises(ValidationError):
         events.parse(newer)
 
