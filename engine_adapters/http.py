@@ -6,6 +6,7 @@ No redirects, no proxies from the environment, no cookies: the adapters speak to
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,14 +34,8 @@ class BoundedHttp:
         self._connect_timeout_s = connect_timeout_s
         self._limit_bytes = limit_bytes
         self._closed = False
-        self._client = httpx.AsyncClient(
-            headers=dict(headers or {}),
-            timeout=httpx.Timeout(timeout_s, connect=connect_timeout_s),
-            # One connection in use and one to spare, so that a decode never holds up the next fetch.
-            limits=httpx.Limits(max_connections=2, max_keepalive_connections=2),
-            follow_redirects=False,
-            trust_env=False,
-        )
+        self._headers = dict(headers or {})
+        self._client: httpx.AsyncClient | None = None
 
     async def request(self, method: str, url: str, *, json: Any = None) -> tuple[int, bytes]:
         """One request. Raises ``Unreachable``, ``TimedOut``, ``ProtocolError``; its connection is closed with them."""
@@ -69,10 +64,29 @@ class BoundedHttp:
     async def close(self) -> None:
         """Close the connections. Safe to call twice."""
         self._closed = True
-        await self._client.aclose()
+        if self._client is not None:
+            await self._client.aclose()
+
+    async def _connected(self, url: str) -> httpx.AsyncClient:
+        if self._client is None:
+            # Reading the system's certificates takes a tenth of a second, which the event loop does not have; without
+            # TLS nothing is verified, so none are read.
+            tls = url.lower().startswith("https:")
+            context = await asyncio.to_thread(ssl.create_default_context) if tls else False
+            self._client = httpx.AsyncClient(
+                headers=self._headers,
+                timeout=httpx.Timeout(self._timeout_s, connect=self._connect_timeout_s),
+                # One connection in use and one to spare, so that a decode never holds up the next fetch.
+                limits=httpx.Limits(max_connections=2, max_keepalive_connections=2),
+                follow_redirects=False,
+                trust_env=False,
+                verify=context,
+            )
+        return self._client
 
     async def _exchange(self, method: str, url: str, json: Any, where: str) -> tuple[int, bytes]:
-        async with self._client.stream(method, url, json=json) as response:
+        client = await self._connected(url)
+        async with client.stream(method, url, json=json) as response:
             body = bytearray()
             async for chunk in response.aiter_bytes():
                 body += chunk

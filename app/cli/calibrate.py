@@ -52,6 +52,8 @@ def calibrate(
     """
     with reported_errors():
         check_out(out, report)
+        if picture_set.is_dir() and not (picture_set / "set.json").is_file():
+            raise WorkFailed(f"{picture_set}: there is no set.json in this folder; write one, it says what is pictured")
         described = read_picture_set(picture_set)
         folder = picture_set if picture_set.is_dir() else picture_set.parent
         with progress_bar("calibrate") as show:

@@ -162,8 +162,9 @@ def _residuals(outcome: LevelOutcome, task: LevelTask, lens: Lens) -> list[tuple
 
 
 def _darkened(picture: Picture) -> Picture:
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)[..., None].astype(np.float32)
-    return np.asarray(0.35 * picture.astype(np.float32) + 0.35 * grey, dtype=np.uint8)
+    """Darker and with half of its colour, so that lines stand out on it."""
+    grey = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    return np.asarray(cv2.addWeighted(picture, 0.35, grey, 0.35, 0), dtype=np.uint8)
 
 
 def _fixed(u: float, v: float) -> tuple[int, int]:

@@ -106,7 +106,7 @@ class PictureTaker:
             acknowledged = time.monotonic()
             while True:
                 requested = time.monotonic()
-                seen = thumbnail(await self._fetch())
+                seen = await self._fetch_small()
                 self.delay.picture_s = time.monotonic() - requested
                 if changed(base, seen):
                     break
@@ -187,17 +187,20 @@ class PictureTaker:
 
     async def _steady(self) -> NDArray[np.float32]:
         """A thumbnail once two in a row are alike: what was set before has arrived."""
-        before = thumbnail(await self._fetch())
+        before = await self._fetch_small()
         deadline = time.monotonic() + _DELAY_BOUND_S
         calm_since = time.monotonic()
         while time.monotonic() < deadline:
-            seen = thumbnail(await self._fetch())
+            seen = await self._fetch_small()
             if changed(before, seen):
                 calm_since = time.monotonic()
             elif time.monotonic() - calm_since > 0.25:
                 return seen
             before = seen
         raise OutputDoesNotFollow("the output keeps changing by itself: is the camera moving, or a video playing?")
+
+    async def _fetch_small(self) -> NDArray[np.float32]:
+        return await self._cpu.run(thumbnail, await self._fetch())
 
     async def _fetch(self) -> Picture:
         async def goal() -> Picture:

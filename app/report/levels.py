@@ -221,8 +221,8 @@ def level_view(level: LevelReport, table: LensTable, opened: bool) -> LevelView:
 
 
 _SHOWN = (
-    (PictureKind.BEFORE, "Before", "camera (rings), engine with the values as found (grid)"),
-    (PictureKind.OVERLAY, "After", "camera (rings), engine's render at the published values (grid)"),
+    (PictureKind.BEFORE, "Before", "camera (rings), engine as found (grid)"),
+    (PictureKind.OVERLAY, "After", "camera (rings), engine's own render (grid)"),
     (PictureKind.UNCERTAINTY, "Expected overlay error", "one sigma, from the fit's covariance"),
     (PictureKind.RESIDUALS, "Residuals", "model minus picture, every corner of every picture"),
     (PictureKind.REAL, "Camera", "as fetched"),

@@ -99,8 +99,8 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
         advice = "take more pictures, the target nearer the corners"
         if fit.nodal_told and fit.sigma_nodal_mm is not None and fit.sigma_nodal_mm > _NODAL_LOOSE_MM:
             advice = (
-                f"the nodal offset is known to {fit.sigma_nodal_mm:.0f} mm only and shows as field of view: add a target "
-                "at another distance"
+                f"the nodal offset is known to {fit.sigma_nodal_mm:.0f} mm only and shows as field of view: add a "
+                "target at another distance"
             )
         trouble.append(f"expected overlay error up to {expected_max_px:.1f} px: {advice}")
     if fit.untold:

@@ -32,7 +32,7 @@ def error_line(result: Result) -> str:
 
 def options_of(command: str) -> set[str]:
     section = reference_text().split(f"\n## lensmatch {command}\n")[1].split("\n## ")[0]
-    return {"--help", *re.findall(r"--[a-z0-9-]+", section)}
+    return {"--help", *re.findall(r"--[a-z][a-z0-9-]+", section)}
 
 
 def test_the_reference_is_current(repository: Path) -> None:
