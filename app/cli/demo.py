@@ -173,7 +173,8 @@ def _show(judged: list[Judged], use: StudioUse, seconds: float, out: Path) -> No
         header_style="bold",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
-        padding=(0, 1),
+        show_edge=False,
+        padding=(0, 0, 0, 1),
     )
     for name in ("zoom", "focus", "FoV deg", "k1_hw", "k2_hw", "shift x", "y px", "pics", "off px"):
         table.add_column(name, justify="right", no_wrap=True)

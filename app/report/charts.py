@@ -7,9 +7,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from markupsafe import Markup
-
 from app.report.numbers import MINUS
+from app.report.svg import Svg, svg
 
 WIDTH, HEIGHT = 460.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 80.0, 14.0, 16.0, 46.0
@@ -63,34 +62,37 @@ class _Axis:
         return self.start + (value - low) / (high - low) * (self.end - self.start)
 
 
-def draw(chart: Chart) -> Markup:
+def draw(chart: Chart) -> Svg:
     """The chart as an ``svg`` element; empty where no point can be drawn."""
     series = [_finite(s, chart.log_y) for s in chart.series]
     faint = [[p for p in line if _drawable(p, chart.log_y)] for line in chart.faint]
     points = [p for s in series for p in s.points]
     if not points:
-        return Markup("")
+        return Svg("")
     everything = points + [p for line in faint for p in line]
     x, y = _axes(everything, chart)
     parts = [
-        Markup('<svg class="chart" viewBox="0 0 {:.0f} {:.0f}" role="img" aria-label="{}">').format(
-            WIDTH, HEIGHT, f"{chart.title}: {chart.y_title} over {chart.x_title}, {len(points)} points"
+        svg(
+            '<svg class="chart" viewBox="0 0 {:.0f} {:.0f}" role="img" aria-label="{}">',
+            WIDTH,
+            HEIGHT,
+            f"{chart.title}: {chart.y_title} over {chart.x_title}, {len(points)} points",
         ),
         *_grid(x, y, chart),
         *(_path([(x.low, b), (x.high, b)], x, y, "band") for b in chart.bands if y.low <= b <= y.high),
         *(_path(line, x, y, "truth") for line in faint if len(line) > 1),
         *(part for s in series for part in _series(s, x, y)),
         *_words(chart.labels, x, y, chart.log_y),
-        Markup("</svg>"),
+        Svg("</svg>"),
     ]
-    return Markup("").join(parts)
+    return Svg("".join(parts))
 
 
-def legend_mark(style: int, hollow: bool, line: bool) -> Markup:
+def legend_mark(style: int, hollow: bool, line: bool) -> Svg:
     """The sign of a series, for a legend in text."""
-    path = Markup('<path class="line s{}" d="M0 6H24"{}/>').format(_colour(style), _dash(style)) if line else ""
-    return Markup('<svg class="mark" viewBox="0 0 24 12" aria-hidden="true">{}{}</svg>').format(
-        path, _marker(style, 12, 6, hollow)
+    path = svg('<path class="line s{}" d="M0 6H24"{}/>', _colour(style), _dash(style)) if line else ""
+    return svg(
+        '<svg class="mark" viewBox="0 0 24 12" aria-hidden="true">{}{}</svg>', path, _marker(style, 12, 6, hollow)
     )
 
 
@@ -159,36 +161,36 @@ def _tick_text(value: float, values: Sequence[float]) -> str:
     return f"{value:.{digits}f}".replace("-", MINUS) if value else "0"
 
 
-def _grid(x: _Axis, y: _Axis, chart: Chart) -> Iterator[Markup]:
+def _grid(x: _Axis, y: _Axis, chart: Chart) -> Iterator[Svg]:
     across = ticks(x.low, x.high, int((WIDTH - LEFT - RIGHT) / _LABEL_STEP_X))
     up = log_ticks(y.low, y.high) if chart.log_y else ticks(y.low, y.high, int((HEIGHT - TOP - BOTTOM) / _LABEL_STEP_Y))
     for value in across:
         at = x.at(value)
-        yield Markup('<path class="grid" d="M{0:.1f} {1:.1f}V{2:.1f}"/>').format(at, TOP, HEIGHT - BOTTOM)
+        yield svg('<path class="grid" d="M{0:.1f} {1:.1f}V{2:.1f}"/>', at, TOP, HEIGHT - BOTTOM)
         yield _text(at, HEIGHT - BOTTOM + 17, _tick_text(value, across), "middle")
     for value in up:
         at = y.at(value)
         zero = " zero" if value == 0 else ""
-        yield Markup('<path class="grid{0}" d="M{1:.1f} {2:.1f}H{3:.1f}"/>').format(zero, LEFT, at, WIDTH - RIGHT)
+        yield svg('<path class="grid{0}" d="M{1:.1f} {2:.1f}H{3:.1f}"/>', zero, LEFT, at, WIDTH - RIGHT)
         text = f"{value:g}" if chart.log_y else _tick_text(value, up)
         yield _text(LEFT - 8, at + 4, text, "end")
-    yield Markup('<path class="axis" d="M{0:.1f} {1:.1f}V{2:.1f}H{3:.1f}"/>').format(
-        LEFT, TOP, HEIGHT - BOTTOM, WIDTH - RIGHT
-    )
+    yield svg('<path class="axis" d="M{0:.1f} {1:.1f}V{2:.1f}H{3:.1f}"/>', LEFT, TOP, HEIGHT - BOTTOM, WIDTH - RIGHT)
     yield _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, chart.x_title, "middle", "title")
     middle = (TOP + HEIGHT - BOTTOM) / 2
-    yield Markup(
-        '<text class="title" x="14" y="{0:.1f}" text-anchor="middle" transform="rotate(-90 14 {0:.1f})">{1}</text>'
-    ).format(middle, chart.y_title)
+    yield svg(
+        '<text class="title" x="14" y="{0:.1f}" text-anchor="middle" transform="rotate(-90 14 {0:.1f})">{1}</text>',
+        middle,
+        chart.y_title,
+    )
 
 
-def _text(x: float, y: float, text: str, anchor: str, kind: str = "tick") -> Markup:
-    return Markup('<text class="{}" x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(kind, x, y, anchor, text)
+def _text(x: float, y: float, text: str, anchor: str, kind: str = "tick") -> Svg:
+    return svg('<text class="{}" x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>', kind, x, y, anchor, text)
 
 
-def _path(points: Sequence[tuple[float, float]], x: _Axis, y: _Axis, kind: str, dash: str = "") -> Markup:
+def _path(points: Sequence[tuple[float, float]], x: _Axis, y: _Axis, kind: str, dash: str = "") -> Svg:
     steps = "L".join(f"{x.at(px):.1f} {y.at(py):.1f}" for px, py in points)
-    return Markup('<path class="{}" d="M{}"{}/>').format(kind, steps, dash)
+    return svg('<path class="{}" d="M{}"{}/>', kind, steps, dash)
 
 
 def _colour(style: int) -> int:
@@ -196,12 +198,12 @@ def _colour(style: int) -> int:
     return style % 4
 
 
-def _dash(style: int) -> Markup:
+def _dash(style: int) -> Svg:
     pattern = _DASHES[(style + style // 4) % len(_DASHES)]
-    return Markup(' stroke-dasharray="{}"').format(pattern) if pattern else Markup("")
+    return svg(' stroke-dasharray="{}"', pattern) if pattern else Svg("")
 
 
-def _series(series: Series, x: _Axis, y: _Axis) -> Iterator[Markup]:
+def _series(series: Series, x: _Axis, y: _Axis) -> Iterator[Svg]:
     if series.line and len(series.points) > 1:
         yield _path(series.points, x, y, f"line s{_colour(series.style)}", _dash(series.style))
     for (px, py), sigma in zip(series.points, series.sigma, strict=True):
@@ -212,26 +214,30 @@ def _series(series: Series, x: _Axis, y: _Axis) -> Iterator[Markup]:
                 low = y.low
             ends = [min(max(y.at(v), TOP), HEIGHT - BOTTOM) for v in (low, high)]
             if abs(ends[0] - ends[1]) > 8:  # shorter ones hide behind the marker
-                yield Markup('<path class="bar s{0}" d="M{1:.1f} {2:.1f}V{3:.1f}"/>').format(
-                    _colour(series.style), at_x, ends[0], ends[1]
+                yield svg(
+                    '<path class="bar s{0}" d="M{1:.1f} {2:.1f}V{3:.1f}"/>',
+                    _colour(series.style),
+                    at_x,
+                    ends[0],
+                    ends[1],
                 )
         yield _marker(series.style, at_x, at_y, series.hollow)
 
 
-def _marker(style: int, x: float, y: float, hollow: bool) -> Markup:
+def _marker(style: int, x: float, y: float, hollow: bool) -> Svg:
     shape = SHAPES[(style + style // 4) % len(SHAPES)]
     kind = f"dot s{_colour(style)}" + (" hollow" if hollow else "")
     if shape == "circle":
-        return Markup('<circle class="{}" cx="{:.1f}" cy="{:.1f}" r="4"/>').format(kind, x, y)
+        return svg('<circle class="{}" cx="{:.1f}" cy="{:.1f}" r="4"/>', kind, x, y)
     outline = {
         "square": "m-3.6 -3.6h7.2v7.2h-7.2z",
         "triangle": "m0 -4.8l4.6 8.2h-9.2z",
         "diamond": "m0 -5l4.4 5l-4.4 5l-4.4 -5z",
     }[shape]
-    return Markup('<path class="{}" d="M{:.1f} {:.1f}{}"/>').format(kind, x, y, outline)
+    return svg('<path class="{}" d="M{:.1f} {:.1f}{}"/>', kind, x, y, outline)
 
 
-def _words(labels: Sequence[tuple[float, float, str]], x: _Axis, y: _Axis, log_y: bool) -> Iterator[Markup]:
+def _words(labels: Sequence[tuple[float, float, str]], x: _Axis, y: _Axis, log_y: bool) -> Iterator[Svg]:
     for px, py, text in labels:
         if _drawable((px, py), log_y):
             at_x, at_y = x.at(px), y.at(py)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from markupsafe import Markup
-
 from app.report.charts import Chart, Series, draw, legend_mark
 from app.report.model import LevelReport, RunReport
 from app.report.numbers import encoder
+from app.report.svg import Svg
 from calibration.lens import Lens
 
 _TRUTH_STEPS = 80
@@ -29,8 +28,8 @@ class Figure:
 
     title: str
     remark: str
-    svg: Markup
-    legend: tuple[tuple[Markup, str], ...]
+    svg: Svg
+    legend: tuple[tuple[Svg, str], ...]
 
 
 def charts(report: RunReport) -> list[Figure]:
@@ -235,9 +234,7 @@ def _figure(chart: Chart, remark: str = "") -> Figure:
     if any(len(line) > 1 for line in chart.faint):
         legend.append(
             (
-                Markup(
-                    '<svg class="mark" viewBox="0 0 24 12" aria-hidden="true"><path class="truth" d="M0 6H24"/></svg>'
-                ),
+                Svg('<svg class="mark" viewBox="0 0 24 12" aria-hidden="true"><path class="truth" d="M0 6H24"/></svg>'),
                 "truth",
             )
         )

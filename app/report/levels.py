@@ -262,7 +262,7 @@ def _used_pictures(level: LevelReport) -> list[tuple[str, str, str, str, str]]:
         return []
     return [
         (
-            view.name,
+            view.name.removesuffix(f" [{view.target_name}]"),
             view.target_name,
             f"{int(view.used.sum())} of {len(view.used)}",
             pixels(view.rms_px),

@@ -87,7 +87,7 @@ def product_version() -> str:
     try:
         return metadata.version("lensmatch")
     except metadata.PackageNotFoundError:
-        return "not installed, run from its sources"
+        return "from its sources"
 
 
 def _tone(report: RunReport) -> str:

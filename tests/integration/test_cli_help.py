@@ -41,9 +41,7 @@ def test_the_reference_is_current(repository: Path) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_with_its_options_and_examples(
-    command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_has_help_with_its_options_and_examples(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     result = invoke(command, "--help")
     assert result.exit_code == 0

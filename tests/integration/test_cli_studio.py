@@ -1,22 +1,27 @@
-"""The commands that speak to an engine: simulate, doctor, run; on the simulated studio, as processes of their own."""
+"""The commands that speak to an engine: simulate, doctor, run; on the simulated studio.
+
+As processes of their own where streams, exit codes and signals are what is tested, else in this one, which is faster.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import json
+import re
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner, Result
 
+from app.cli.commands import cli
 from app.cli.simulated import studio_job, studio_profile, true_lens
-from app.documents import JobRequest
 from calibration.compare import overlay
 from engine_adapters.profile import profile_toml
 from engine_adapters.r3.client import R3Engine
@@ -49,16 +54,33 @@ def write_profile(folder: Path, addresses: dict[str, Any]) -> None:
     (folder / "studio.toml").write_text(text, "utf-8")
 
 
-def write_job(folder: Path, addresses: dict[str, Any], levels: list[tuple[float, float]], **changes: Any) -> JobRequest:
-    request = studio_job(addresses, LENS, levels)
-    document = request.model_dump(mode="json", exclude_none=True) | changes
-    (folder / "job.json").write_text(json.dumps(document), "utf-8")
-    return request
+def write_job(
+    folder: Path, addresses: dict[str, Any], at: Sequence[tuple[float, float]] = ((0.5, 0.25),), **changes: Any
+) -> Path:
+    """A job for these levels, in ``job.json``."""
+    document = studio_job(addresses, LENS, at).model_dump(mode="json", exclude_none=True) | changes
+    path = folder / "job.json"
+    path.write_text(json.dumps(document), "utf-8")
+    return path
 
 
-def reason(done: Any, code: int = 1) -> str:
-    """The one error line of a command that failed with this code and printed nothing on standard output."""
-    assert done.returncode == code, done.stderr
+def invoke(*words: str | Path) -> Result:
+    return CliRunner().invoke(cli, [str(word) for word in words])
+
+
+@pytest.fixture
+def folder(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the commands of this process work and keep their database."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(repository))  # for the simulated studio's process
+    monkeypatch.setenv("LENSMATCH_DATABASE", str(tmp_path / "lensmatch.db"))
+    monkeypatch.setenv("LENSMATCH_CPU_WORKERS", "1")
+    return tmp_path
+
+
+def reason(done: Result) -> str:
+    """The one error line of a command that failed and printed nothing on standard output."""
+    assert done.exit_code == 1, done.output
     assert done.stdout == ""
     lines: list[str] = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1, done.stderr
@@ -77,18 +99,19 @@ def no_engine() -> dict[str, Any]:
     }
 
 
-async def test_doctor_and_run_on_a_studio_that_is_in_order(lensmatch: Any) -> None:
-    folder = lensmatch.folder
+@pytest.mark.slow
+async def test_doctor_and_run_on_a_studio_that_is_in_order(lensmatch: Any, folder: Path) -> None:
     async with studio(folder) as addresses:
         engine = R3Engine.from_profile(studio_profile(addresses, LENS.image_size))
         before = await engine.read_state()
-        told = json.loads((await lensmatch("doctor", "--studio", "studio.toml", "--measure-delay", "--json")).stdout)
+        words = ("doctor", "--studio", "studio.toml", "--measure-delay", "--json")
+        told = json.loads((await asyncio.to_thread(invoke, *words)).stdout)
         assert told["ok"] is True, told
         names = [check["name"] for check in told["checks"]]
         assert names[-5:] == ["engine", "tracking", "mockboard", "output", "head"]
         assert all(check["detail"] for check in told["checks"])
 
-        write_job(folder, addresses, [(0.5, 0.25)], engine="studio 1")
+        write_job(folder, addresses, engine="studio 1")
         words = ("run", "job.json", "--studio", "studio.toml", "--out", "table.json", "--report", "report.html")
         done = await lensmatch(*words, "--json")
         assert done.returncode == 0, done.stderr
@@ -102,6 +125,7 @@ async def test_doctor_and_run_on_a_studio_that_is_in_order(lensmatch: Any) -> No
         await engine.close()
 
 
+@pytest.mark.slow
 async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(lensmatch: Any) -> None:
     folder = lensmatch.folder
     async with contextlib.AsyncExitStack() as stack:
@@ -109,7 +133,7 @@ async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(lensmatc
         write_job(folder, addresses, LEVELS)
         words = ("run", "job.json", "--studio", "studio.toml", "--out", "table.json")
         async with lensmatch.started(*words) as process:
-            await level_done(folder)
+            await level_done(process)
             await stack.aclose()
             out, err = await asyncio.wait_for(process.communicate(), BOUND_S)
         assert process.returncode == 1
@@ -120,6 +144,7 @@ async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(lensmatc
     assert await stored(folder) == (JobState.FAILED, True)
 
 
+@pytest.mark.slow
 @posix_signals
 async def test_ctrl_c_cancels_the_job_and_restores_the_engine(lensmatch: Any) -> None:
     folder = lensmatch.folder
@@ -128,7 +153,7 @@ async def test_ctrl_c_cancels_the_job_and_restores_the_engine(lensmatch: Any) ->
         before = await engine.read_state()
         write_job(folder, addresses, LEVELS)
         async with lensmatch.started("run", "job.json", "--studio", "studio.toml") as process:
-            await level_done(folder)
+            await level_done(process)
             process.send_signal(signal.SIGINT)
             out, err = await asyncio.wait_for(process.communicate(), BOUND_S)
         assert process.returncode == 1
@@ -140,18 +165,14 @@ async def test_ctrl_c_cancels_the_job_and_restores_the_engine(lensmatch: Any) ->
     assert await stored(folder) == (JobState.CANCELLED, True)
 
 
-async def level_done(folder: Path) -> None:
-    """Wait until the job's first level is stored."""
+async def level_done(process: asyncio.subprocess.Process) -> None:
+    """Wait until the progress on standard error is past the first of five levels."""
+    assert process.stderr is not None
     async with asyncio.timeout(BOUND_S):
-        while not (folder / "lensmatch.db").exists():
-            await asyncio.sleep(0.05)
-        await asyncio.sleep(1.0)  # the database is being made; a reader must not meet it half migrated
-        async with await Repository.open(folder / "lensmatch.db", lambda: datetime.now(UTC)) as repository:
-            while True:
-                jobs = (await repository.list_jobs()).jobs
-                if jobs and await repository.list_levels(jobs[0].id):
-                    return
-                await asyncio.sleep(0.05)
+        while line := await process.stderr.readline():
+            if re.search(rb"level [2-5]/5", line):
+                return
+    pytest.fail("the command ended before a level was done")
 
 
 async def stored(folder: Path) -> tuple[JobState, bool]:
@@ -161,28 +182,26 @@ async def stored(folder: Path) -> tuple[JobState, bool]:
         return job.state, bool(await repository.list_levels(job.id))
 
 
-async def test_a_target_behind_the_camera_fails_with_its_reason(lensmatch: Any) -> None:
-    folder = lensmatch.folder
+async def test_a_target_behind_the_camera_fails_with_its_reason(folder: Path) -> None:
     async with studio(folder) as addresses:
-        write_job(folder, addresses, [(0.5, 0.25)], targets=no_engine()["survey"]["targets"])
-        document = json.loads((folder / "job.json").read_text("utf-8"))
-        document["targets"]["board"]["pose"]["centre_m"] = [0.0, -5.0, 1.6]
-        (folder / "job.json").write_text(json.dumps(document), "utf-8")
-        line = reason(await lensmatch("run", "job.json", "--studio", "studio.toml", "--out", "table.json"))
+        targets = no_engine()["survey"]["targets"]
+        targets["board"]["pose"]["centre_m"] = [0.0, -5.0, 1.6]
+        write_job(folder, addresses, targets=targets)
+        words = ("run", "job.json", "--studio", "studio.toml", "--out", "table.json")
+        line = reason(await asyncio.to_thread(invoke, *words))
         assert "no level could be measured" in line
         assert not (folder / "table.json").exists()
 
 
-async def test_an_engine_that_is_not_there(lensmatch: Any) -> None:
-    folder = lensmatch.folder
+def test_an_engine_that_is_not_there(folder: Path) -> None:
     write_profile(folder, no_engine())
-    write_job(folder, no_engine(), [(0.5, 0.25)])
-    line = reason(await lensmatch("run", "job.json", "--studio", "studio.toml", "--out", "table.json"))
+    write_job(folder, no_engine())
+    line = reason(invoke("run", "job.json", "--studio", "studio.toml", "--out", "table.json"))
     assert "R3 at 127.0.0.1:1" in line
     assert "start R3" in line
     assert not (folder / "table.json").exists()
-    done = await lensmatch("doctor", "--studio", "studio.toml", "--json")
-    assert done.returncode == 1
+    done = invoke("doctor", "--studio", "studio.toml", "--json")
+    assert done.exit_code == 1
     told = json.loads(done.stdout)
     assert told["ok"] is False
     failed = {check["name"]: check for check in told["checks"] if not check["ok"]}
@@ -191,20 +210,19 @@ async def test_an_engine_that_is_not_there(lensmatch: Any) -> None:
     assert "start R3" in failed["engine"]["advice"]
 
 
-async def test_an_engine_that_answers_nonsense(lensmatch: Any) -> None:
-    folder = lensmatch.folder
+async def test_an_engine_that_answers_nonsense(folder: Path) -> None:
     async with studio(folder, "--fault", "r3:garbage@*", "--fault", "mockboard:garbage@*") as addresses:
-        write_job(folder, addresses, [(0.5, 0.25)])
-        assert "R3 at 127.0.0.1" in reason(await lensmatch("run", "job.json", "--studio", "studio.toml"))
-        done = await lensmatch("doctor", "--studio", "studio.toml", "--json")
+        write_job(folder, addresses)
+        done = await asyncio.to_thread(invoke, "run", "job.json", "--studio", "studio.toml")
+        assert "R3 at 127.0.0.1" in reason(done)
+        done = await asyncio.to_thread(invoke, "doctor", "--studio", "studio.toml", "--json")
         failed = {check["name"] for check in json.loads(done.stdout)["checks"] if not check["ok"]}
-        assert done.returncode == 1
+        assert done.exit_code == 1
         assert failed == {"engine", "tracking", "mockboard"}
 
 
-async def test_an_operators_head_needs_a_terminal(lensmatch: Any) -> None:
-    write_job(lensmatch.folder, no_engine(), [(0.5, 0.25)])
-    assert "standard input is no terminal" in reason(await lensmatch("run", "job.json"))
+def test_an_operators_head_needs_a_terminal(folder: Path) -> None:
+    assert "standard input is no terminal" in reason(invoke("run", write_job(folder, no_engine())))
 
 
 @pytest.mark.parametrize(
@@ -221,25 +239,19 @@ async def test_an_operators_head_needs_a_terminal(lensmatch: Any) -> None:
         ({"job": 2}, "job"),
     ],
 )
-def test_a_bad_job_names_the_field(change: dict[str, Any], told: str, tmp_path: Path) -> None:
-    from typer.testing import CliRunner
-
-    from app.cli.commands import cli
-
-    write_job(tmp_path, no_engine(), [(0.5, 0.25)], **change)
-    done = CliRunner().invoke(cli, ["run", str(tmp_path / "job.json"), "--database", str(tmp_path / "x.db")])
-    assert done.exit_code == 1
-    assert told in done.stderr
+def test_a_bad_job_names_the_field(change: dict[str, Any], told: str, folder: Path) -> None:
+    done = invoke("run", write_job(folder, no_engine(), **change))
+    assert told in reason(done)
     assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "x.db").exists()
+    assert [path.name for path in folder.iterdir()] == ["job.json"]
 
 
-async def test_a_bad_profile_names_the_key(lensmatch: Any) -> None:
-    write_job(lensmatch.folder, no_engine(), [(0.5, 0.25)])
-    (lensmatch.folder / "studio.toml").write_text("[r3]\nprot = 9009\n", "utf-8")
+def test_a_bad_profile_names_the_key(folder: Path) -> None:
+    write_job(folder, no_engine())
+    (folder / "studio.toml").write_text("[r3]\nprot = 9009\n", "utf-8")
     for words in (("run", "job.json"), ("doctor",)):
-        assert "r3.prot: unknown key" in reason(await lensmatch(*words, "--studio", "studio.toml"))
-    assert "none.toml" in reason(await lensmatch("doctor", "--studio", "none.toml"))
+        assert "r3.prot: unknown key" in reason(invoke(*words, "--studio", "studio.toml"))
+    assert "none.toml" in reason(invoke("doctor", "--studio", "none.toml"))
 
 
 @posix_signals
@@ -256,8 +268,7 @@ async def test_simulate_prints_its_addresses_and_ends_with_ctrl_c(lensmatch: Any
     assert (process.returncode, out, err) == (0, b"", b"")
 
 
-async def test_simulate_refuses_what_it_cannot_run_with(lensmatch: Any) -> None:
-    folder = lensmatch.folder
+def test_simulate_refuses_what_it_cannot_run_with(folder: Path) -> None:
     truth = LENS.truth()
     (folder / "folded.json").write_text(json.dumps(truth | {"levels": [{**truth["levels"][0], "k1": -3.0}]}), "utf-8")
     (folder / "broken.json").write_text("{", "utf-8")
@@ -269,8 +280,8 @@ async def test_simulate_refuses_what_it_cannot_run_with(lensmatch: Any) -> None:
             (("--lens-file", "none.json", *PORTS), "none.json"),
             ((*PORTS, "--r3-port", str(port)), f"127.0.0.1:{port}"),
         ):
-            done = await lensmatch("simulate", *words)
-            assert done.returncode == 1, done.stderr
+            done = invoke("simulate", *words)
+            assert done.exit_code == 1, done.stderr
             assert done.stdout == ""
             assert told in done.stderr
             assert len(done.stderr.splitlines()) == 1
