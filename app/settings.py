@@ -28,8 +28,9 @@ def default_database() -> Path:
 
 
 def default_cpu_workers() -> int:
-    """One worker less than there are processors, so that the service itself keeps one; at least one, at most eight."""
-    return max(1, min(8, (os.cpu_count() or 1) - 1))
+    """One for each processor, at least two, so that decoding a picture never waits for finding in the one before; at
+    most eight."""
+    return max(2, min(8, os.cpu_count() or 2))
 
 
 class Settings(BaseSettings):

@@ -26,6 +26,9 @@ LEAVE_BOUND_S = 1.0
 HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 """Children that the standard library starts once and keeps for the whole run."""
 
+# The helpers in ``support`` check too: their failures tell what was compared, like those of the tests.
+pytest.register_assert_rewrite("tests.support")
+
 settings.register_profile(
     "house",
     derandomize=True,

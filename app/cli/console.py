@@ -31,8 +31,8 @@ EXIT_USAGE = 2
 
 KNOWN_ERRORS = (AdapterError, CalibrationError, DocumentError, EngineError, ServiceError, StorageError)
 
-messages = Console(stderr=True, highlight=False, soft_wrap=True)
-results = Console(highlight=False, soft_wrap=True)
+messages = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+results = Console(highlight=False, soft_wrap=True, emoji=False)
 
 Show = Callable[[float, str], None]
 """Told how far the work is (0..1) and what is being done."""
@@ -58,6 +58,8 @@ def reported_errors() -> Iterator[None]:
 def os_reason(error: OSError) -> str:
     """The file and what the system says of it, without its error number."""
     reason = error.strerror or str(error) or type(error).__name__
+    if isinstance(error, FileExistsError):
+        reason = "is a file already, not a folder; give another name"
     return f"{error.filename}: {reason}" if error.filename else reason
 
 

@@ -259,3 +259,9 @@ def test_an_out_file_stays_whole_when_writing_fails(
     assert "No space left" in reason(invoke("export", golden, "--format", "csv", "--out", out))
     assert out.read_text() == "the old one"
     assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_a_demo_into_a_file_is_one_line(tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    assert "is a file already" in reason(invoke("demo", "--out", taken))

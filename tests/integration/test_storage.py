@@ -8,7 +8,7 @@ import hashlib
 import sqlite3
 from collections.abc import AsyncIterator
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +27,10 @@ from storage.errors import (
 from storage.exports import EXPORTS
 from storage.records import JobRecord, JobState, PictureKind
 from storage.repository import MAX_PICTURE_BYTES, Repository
+from tests.support.clock import Clock
 
 SIZE = (1920, 1080)
 DONE = ("level_done", {"zoom": 0.0})
-
-
-class Clock:
-    """A clock that is a second later at each look."""
-
-    def __init__(self) -> None:
-        self.moment = datetime(2026, 11, 21, 10, 0, 0, tzinfo=UTC)
-
-    def __call__(self) -> datetime:
-        self.moment += timedelta(seconds=1)
-        return self.moment
 
 
 def level(zoom: float = 0.0, focus: float = 0.5) -> LevelResult:
