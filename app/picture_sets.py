@@ -14,7 +14,7 @@ from calibration.detect.target import find_target
 from calibration.errors import CalibrationError, InvalidInput
 from calibration.image import Transfer, decode_picture
 from calibration.solve.level import LevelFit, held_out_residuals, solve_level
-from calibration.solve.outcome import level_result
+from calibration.solve.outcome import level_result, shift_only_result
 from calibration.solve.problem import View
 from calibration.tables import Frames, LeftOut, LensTable, LevelResult, LevelStatus
 from calibration.types import Refusal
@@ -117,6 +117,10 @@ def _solve(
         held_out = held_out_residuals(fit, views)
         result = level_result(fit, zoom, focus, held_out=held_out, left_out=left_out)
     except CalibrationError as error:
+        shift_only = shift_only_result(views, described.image_size, zoom, focus, left_out)
+        if shift_only is not None:
+            shift_only = replace(shift_only, frames=Frames(real=len(pictures)))
+            return SetLevel(shift_only, None, tuple(views))
         reason = str(error)
         if not views and left_out:
             reason += f"; {left_out[0].picture}: {left_out[0].reason}"

@@ -19,7 +19,7 @@ from app.jobs.cpu import Cpu
 from app.picture_sets import SetLevel, calibrate_set, table_of
 from app.report import picture_set_report, write_report
 from app.settings import default_cpu_workers
-from calibration.tables import LensTable, LevelResult
+from calibration.tables import LensTable, LevelResult, LevelStatus
 from engine_adapters.folder import FolderPictures
 from storage.exports import EXPORTS
 from storage.schemas import table_to_document
@@ -91,7 +91,7 @@ async def _calibrate(
 
 
 def _is_measured(result: LevelResult) -> bool:
-    return result.fov_x_deg is not None
+    return result.status is not LevelStatus.FAILED
 
 
 def _why_nothing(described: PictureSet, levels: list[SetLevel]) -> str:

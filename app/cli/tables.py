@@ -54,13 +54,13 @@ def _add_level(grid: Table, level: LevelResult) -> None:
     pictures = f"{max(level.frames.real - gone, 0)}/{level.frames.real}"
     if level.frames.virtual:
         pictures = f"{level.frames.real}+{level.frames.virtual}"
-    if level.fov_x_deg is None:
+    if level.status is LevelStatus.FAILED:
         grid.add_row(*place, *[""] * 8, pictures if taken else "")
         return
     shift = level.center_shift_px or (None, None)
     grid.add_row(
         *place,
-        f"{level.fov_x_deg:.4f}",
+        "-" if level.fov_x_deg is None else f"{level.fov_x_deg:.4f}",
         _number(level.k1, 5),
         _number(level.k2, 5),
         _number(shift[0], 3),

@@ -7,14 +7,27 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from calibration.camera import target_points_world, world_to_camera
 from calibration.compare import NEGLIGIBLE_PX, edge_effect_px, predicted_overlay
+from calibration.solve.center_shift import center_shift_from_centre
 from calibration.solve.level import LevelFit
-from calibration.tables import LeftOut, LevelResult, LevelStatus, PixelError, Sigma
+from calibration.solve.problem import View
+from calibration.tables import (
+    EVIDENCE_QUANTITIES,
+    LENS_QUANTITIES,
+    LeftOut,
+    LevelResult,
+    LevelStatus,
+    PixelError,
+    Sigma,
+)
 from calibration.types import FloatArray
 
 USABLE_OVERLAY_PX = 1.0
 """Expected overlay error above which a level is called degraded: a shift that a viewer begins to see."""
 
+_ON_AXIS = 1e-4
+# Tangent of the angle off the optical axis under which a thing counts as on it: half a pixel at 5,000 px.
 _NODAL_LOOSE_MM = 2.0
 # A nodal offset less certain than this is what most of a large expected error comes from.
 _NODAL_HINT = 3.0
@@ -51,7 +64,7 @@ def level_result(
     elif not fit.nodal_told:
         reasons["nodal_offset_mm"] = (
             f"not told apart from {fit.lens.nodal_offset_mm:g} mm, which is taken: the pictures alone say "
-            f"{fit.nodal_seen_mm[0]:.1f} +- {fit.nodal_seen_mm[1]:.1f} mm"
+            f"{fit.nodal_seen_mm[0]:.1f} ± {fit.nodal_seen_mm[1]:.1f} mm"
         )
     if held is None:
         reasons["held_out_px"] = "no picture could be spared from the fit"
@@ -109,7 +122,7 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
         seen_mm, sigma_mm = fit.nodal_seen_mm
         if abs(seen_mm - fit.lens.nodal_offset_mm) > _NODAL_HINT * sigma_mm:
             trouble.append(
-                f"the pictures hint at a nodal offset of {seen_mm:.0f} +- {sigma_mm:.0f} mm, not "
+                f"the pictures hint at a nodal offset of {seen_mm:.0f} ± {sigma_mm:.0f} mm, not "
                 f"{fit.lens.nodal_offset_mm:g} mm; if so the field of view is off: add a target at another distance"
             )
     share = len(fit.outliers) / max(fit.points + len(fit.outliers), 1)
@@ -121,3 +134,39 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
             "profile's (check the radius unit of k1 and k2, the centre shift's sign and origin, the FoV's axis)"
         )
     return trouble
+
+
+def shift_only_result(
+    views: Sequence[View], image_size: tuple[int, int], zoom: float, focus: float, left_out: Sequence[LeftOut] = ()
+) -> LevelResult | None:
+    """A level of which nothing but the centre shift can be told: a light or target on the optical axis.
+
+    None when no picture shows such a thing. The mean of all of them, weighted with their covariances.
+    """
+    shifts = [center_shift_from_centre(v.detection, image_size) for v in views if _on_axis(v)]
+    if not shifts:
+        return None
+    weights = [np.linalg.inv(shift.covariance_px2) for shift in shifts]
+    covariance = np.linalg.inv(np.sum(weights, axis=0))
+    mean = covariance @ np.sum([w @ np.asarray(s.shift_px) for w, s in zip(weights, shifts, strict=True)], axis=0)
+    why = "not told: the pictures show only where the optical axis is; add pictures of a target beside it"
+    quantities = (*LENS_QUANTITIES, *EVIDENCE_QUANTITIES)
+    return LevelResult(
+        zoom,
+        focus,
+        LevelStatus.DEGRADED,
+        center_shift_px=(float(mean[0]), float(mean[1])),
+        sigma=Sigma(center_shift_px=(math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1]))),
+        left_out=tuple(left_out),
+        reason="only the centre shift is told",
+        reasons={name: why for name in quantities if name != "center_shift_px"},
+    )
+
+
+def _on_axis(view: View) -> bool:
+    """Whether the target's centre lies on the optical axis, as surveyed: within a ten-thousandth of its distance."""
+    if view.camera_pose is None or view.target.pose is None:
+        return False
+    centre = target_points_world(view.target.pose, np.zeros((1, 2)))
+    x, y, z = world_to_camera(view.camera_pose, 0.0, centre)[0]
+    return bool(z > 0 and math.hypot(x, y) < _ON_AXIS * z)
