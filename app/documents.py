@@ -200,9 +200,11 @@ def _read_json(path: Path) -> object:
 
 def read_picture_set(folder: Path) -> PictureSet:
     """The picture set in ``folder`` (or the ``set.json`` itself). Raises :class:`DocumentError`."""
-    path = folder / "set.json" if folder.is_dir() else folder
-    if not path.exists() and folder.suffix != ".json":
+    if folder.is_dir() and not (folder / "set.json").exists():
+        raise DocumentError(f"{folder}: has no set.json; a picture set is a folder with one, see the how-to")
+    if not folder.exists() and folder.suffix != ".json":
         raise DocumentError(f"{folder}: no such folder; a picture set is a folder with a set.json")
+    path = folder / "set.json" if folder.is_dir() else folder
     try:
         return PictureSet.model_validate(_read_json(path))
     except ValidationError as error:

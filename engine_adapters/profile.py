@@ -198,7 +198,7 @@ class HeadSettings(_Section):
     kind: Literal["operator", "simulated", "visca"] = Field(
         default="operator", description="operator (a person is asked), simulated, or visca (not available yet)"
     )
-    url: WebAddress = Field(default="http://127.0.0.1:1988/head", description="address of the simulated head")
+    url: WebAddress = Field(default="http://127.0.0.1:9010/head", description="address of the simulated head")
     timeout_s: Seconds = Field(
         default=30.0, description="longest wait for a movement; a full pan of a slow head takes 20 s"
     )
@@ -261,7 +261,7 @@ def load_profile(path: str | Path) -> StudioProfile:
             data = file.read(FILE_LIMIT_BYTES + 1)
     except OSError as error:
         raise ProfileError(
-            f"cannot be read ({error.strerror or error}); `lensmatch doctor` prints a profile to start from",
+            f"cannot be read ({error.strerror or error}); `lensmatch doctor --print-profile` prints one to start from",
             where=where,
         ) from error
     except ValueError as error:  # a NUL in the name

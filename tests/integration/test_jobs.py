@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,18 @@ from calibration.compare import overlay
 from calibration.tables import LevelStatus
 from engine_adapters.r3.client import R3Engine
 from engine_adapters.sim.launch import launched_studio
-from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded
+from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded, parse_lens
 from storage.records import EventRecord, JobState, PictureKind
 
-LENS = load_embedded(embedded_lens_names()[0])
-FAST = ("--picture-time-ms", "4", "--head-speed", "2000")
+FULL = load_embedded(embedded_lens_names()[0]).truth()
+SMALL_TRUTH = FULL | {
+    "image_size": [960, 540],  # a quarter of the pixels: these tests are of jobs, not of exactness
+    "levels": [
+        level | {"center_shift_px": [shift / 2 for shift in level["center_shift_px"]]} for level in FULL["levels"]
+    ],
+}
+LENS = parse_lens(SMALL_TRUTH)
+FAST = ("--picture-time-ms", "4", "--head-speed", "2000", "--payload-format", "jpeg")
 BOUND_S = 60.0
 ENOUGH_TIME_S = 90
 
@@ -66,9 +74,15 @@ class Bench:
             await engine.close()
 
 
+def fast_studio(folder: Path, *options: str) -> contextlib.AbstractAsyncContextManager[dict[str, Any]]:
+    truth = folder / "truth.json"
+    truth.write_text(json.dumps(SMALL_TRUTH))
+    return launched_studio(("--lens-file", str(truth), *FAST, *options))
+
+
 @contextlib.asynccontextmanager
 async def bench(database: Path, *options: str, queue_limit: int = 100) -> AsyncIterator[Bench]:
-    async with launched_studio((*FAST, *options)) as addresses:
+    async with fast_studio(database.parent, *options) as addresses:
         engines = studio_engines(studio_profile(addresses, LENS.image_size))
         settings = Settings(database=database, queue_limit=queue_limit)
         async with running_service(settings, engines) as service:
@@ -203,7 +217,7 @@ async def test_an_engine_that_is_not_there_fails_the_job_with_its_address(tmp_pa
 async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(tmp_path: Path) -> None:
     async with contextlib.AsyncExitStack() as stack:
         studio = await stack.enter_async_context(contextlib.AsyncExitStack())
-        addresses = await studio.enter_async_context(launched_studio(FAST))
+        addresses = await studio.enter_async_context(fast_studio(tmp_path))
         engines = studio_engines(studio_profile(addresses, LENS.image_size))
         service = await stack.enter_async_context(running_service(Settings(database=tmp_path / "jobs.db"), engines))
         b = Bench(service, addresses)
@@ -221,7 +235,7 @@ async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(tmp_path
 
 @pytest.mark.timeout(ENOUGH_TIME_S)
 async def test_a_restart_takes_up_what_was_queued_and_ends_what_ran(tmp_path: Path) -> None:
-    async with launched_studio(FAST) as addresses:
+    async with fast_studio(tmp_path) as addresses:
         engines = studio_engines(studio_profile(addresses, LENS.image_size))
         settings = Settings(database=tmp_path / "jobs.db")
         async with running_service(settings, engines) as service:
