@@ -45,7 +45,7 @@ from calibration.solve.search import LevelMethod, LevelTask
 from calibration.tables import LensTable, LevelResult, LevelStatus
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import LensValues, RenderEngine
-from storage.errors import StorageError
+from storage.errors import StaleState, StorageError
 from storage.records import JobRecord, JobState, PictureKind
 from storage.repository import Repository
 
@@ -189,6 +189,14 @@ class JobRunner:
 
     async def cancel(self, job_id: str) -> JobRecord:
         """End a job at once; a job that has ended is left as it is. Raises NotFound."""
+        while True:
+            try:
+                return await self._cancel(job_id)
+            except StaleState:
+                # It began or ended between the look and the change; each state is left once, so this ends.
+                continue
+
+    async def _cancel(self, job_id: str) -> JobRecord:
         record = await self._repository.get_job(job_id)
         if record.state is JobState.QUEUED:
             return await self._change(job_id, JobState.CANCELLED, "cancelled before it began", JobCancelled())
@@ -314,6 +322,11 @@ class JobRunner:
         except AdapterError as error:
             failed = LevelResult.failed(task.zoom, task.focus, str(error))
             return LevelOutcome(failed, None, None, ()), error
+        except Exception as error:
+            # A mistake of ours costs its level, not the job.
+            log.exception("a level of job %s failed by a mistake of ours", job_id)
+            reason = f"internal error ({type(error).__name__}); the log has the details"
+            return LevelOutcome(LevelResult.failed(task.zoom, task.focus, reason), None, None, ()), None
 
     async def _commit(self, job_id: str, ordinal: int, result: LevelResult) -> None:
         event: AnyEvent
@@ -359,11 +372,14 @@ class JobRunner:
 
     async def _end_cancelled(self, job_id: str) -> None:
         """A cancelled task: the operator's cancel, or the service ending."""
-        record = await self._repository.get_job(job_id)
-        if record.state is JobState.CANCELLING:
-            await self._change(job_id, JobState.CANCELLED, "cancelled; finished levels are kept", JobCancelled())
-        elif record.state is JobState.RUNNING:
-            await self._fail(job_id, "the service stopped while the job ran; its finished levels are kept")
+        try:
+            record = await self._repository.get_job(job_id)
+            if record.state is JobState.CANCELLING:
+                await self._change(job_id, JobState.CANCELLED, "cancelled; finished levels are kept", JobCancelled())
+            elif record.state is JobState.RUNNING:
+                await self._fail(job_id, "the service stopped while the job ran; its finished levels are kept")
+        except StorageError as error:
+            log.error("the end of job %s could not be stored: %s", job_id, error)
 
     async def _fail(self, job_id: str, reason: str) -> None:
         try:

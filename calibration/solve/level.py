@@ -121,6 +121,22 @@ def solve_level(
     names = [v.name for v in views]
     if len(set(names)) != len(names):
         raise InvalidInput("picture names", names, "each view needs a name of its own")
+    try:
+        fit = _solve(views, image_size, pixel_aspect, nodal_offset_mm, nodal_sigma_mm, guess)
+    except np.linalg.LinAlgError as error:
+        raise NotConverged("the level's fit (its equations are singular)", 0, math.nan) from error
+    fit.lens.require_unfolded()
+    return fit
+
+
+def _solve(
+    views: Sequence[View],
+    image_size: tuple[int, int],
+    pixel_aspect: float,
+    nodal_offset_mm: float,
+    nodal_sigma_mm: float,
+    guess: Lens | None,
+) -> LevelFit:
     kept, dropped = list(views), []
     while True:
         _require_enough(kept)
@@ -145,15 +161,13 @@ def solve_level(
             fitted = _Fit(kept, given, fitted.free_poses(), held=("nodal_offset_mm",))
             fitted.run()
             fit = fitted.result(tuple(dropped))
-    held = _untold(fit)
-    if held:
-        kept_nodal = () if nodal_told else ("nodal_offset_mm",)
-        again = _Fit(kept, fit.lens, fitted.free_poses(), held=(*held, *kept_nodal))
+    untold = _untold(fit)
+    if untold:
+        held = untold if nodal_told else (*untold, "nodal_offset_mm")
+        again = _Fit(kept, fit.lens, fitted.free_poses(), held=held)
         again.run()
         fit = replace(again.result(tuple(dropped)), covariance=fit.covariance, sigma_nodal_mm=fit.sigma_nodal_mm)
-    fit = replace(fit, untold=held, nodal_told=nodal_told, nodal_seen_mm=seen)
-    fit.lens.require_unfolded()
-    return fit
+    return replace(fit, untold=untold, nodal_told=nodal_told, nodal_seen_mm=seen)
 
 
 def _untold(fit: LevelFit) -> tuple[str, ...]:
