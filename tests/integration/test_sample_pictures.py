@@ -48,8 +48,8 @@ def by_opencv(paths: list[Path]) -> tuple[FloatArray, FloatArray]:
         [grid] * len(points), points, size, np.eye(3), np.zeros(5), flags=flags
     )
     k, s = distortion.ravel(), sigmas.ravel()
-    # The order of the sigmas: fx, fy, cx, cy, k1, k2.
-    return np.array([matrix[0, 0], k[0], k[1], matrix[0, 2], matrix[1, 2]]), s[[0, 4, 5, 2, 3]]
+    # The order of the sigmas: fx, fy, cx, cy, k1, k2; with one focal length it stands at fy.
+    return np.array([matrix[0, 0], k[0], k[1], matrix[0, 2], matrix[1, 2]]), s[[1, 4, 5, 2, 3]]
 
 
 async def test_real_photographs_reach_the_asked_residual_and_agree_with_opencv(shared_data: Path) -> None:
