@@ -149,6 +149,8 @@ class JobRequest(_Strict):
     pivot_m: tuple[Finite, Finite, Finite] = Field(description="where the camera's pivot stands")
     pivot_sigma_m: NotNegative = 0.0
     angle_sigma_deg: NotNegative = Field(default=0.0, description="the head's encoders, one sigma")
+    nodal_offset_mm: Finite = Field(default=0.0, description="pivot to entrance pupil; stands unless contradicted")
+    nodal_sigma_mm: NotNegative = Field(default=0.0, description="how well it is known; more than 0: only a prior")
     goal_px: Positive = Field(default=0.03, description="largest expected overlay error at which pictures stop")
     max_views: Annotated[int, Field(ge=2, le=100)] = 12
 
@@ -163,6 +165,11 @@ class JobRequest(_Strict):
                 raise ValueError(f"levels[{index}] (zoom {level.zoom:g}, focus {level.focus:g}) is listed twice")
             seen.add((level.zoom, level.focus))
         return self
+
+
+def schema_text(model: type[BaseModel]) -> str:
+    """A document's JSON Schema as it stands in ``docs/reference``."""
+    return json.dumps(model.model_json_schema(), indent=1, sort_keys=True) + "\n"
 
 
 def one_line(error: ValidationError) -> str:

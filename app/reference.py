@@ -1,4 +1,4 @@
-"""Writes the reference that is made from the code: OpenAPI, event schemas, settings. A test checks that it is current.
+"""Writes the reference that is made from the code: OpenAPI, schemas, settings. A test checks that it is current.
 
 ``python -m app.reference docs/reference``
 """
@@ -8,14 +8,16 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from app import events, main, settings
+from app import documents, events, main, settings
 
 
 def pages() -> dict[str, str]:
     """The generated pages by file name."""
     return {
         "events.schema.json": events.schema_text(),
+        "job.schema.json": documents.schema_text(documents.JobRequest),
         "openapi.json": main.openapi_text(),
+        "picture-set.schema.json": documents.schema_text(documents.PictureSet),
         "settings.md": settings.reference_text(),
     }
 

@@ -45,8 +45,8 @@ def last_measured(done: Sequence[LevelResult], request: JobRequest) -> Lens | No
 def level_task(request: JobRequest, zoom: float, focus: float, done: Sequence[LevelResult]) -> LevelTask:
     """What a method must know of one level of a job, after the levels ``done``.
 
-    Once a level has shown that the pupil is not at the pivot, no later one may take it to be there: the nodal offset
-    then starts from the nearest level's, as a prior.
+    Once a level has shown that the pupil is not where the job says, no later one may take it to be there: the nodal
+    offset then starts from the level measured last, as a prior.
     """
     nodal = [result.nodal_offset_mm for result in done if result.nodal_offset_mm is not None]
     return LevelTask(
@@ -58,8 +58,8 @@ def level_task(request: JobRequest, zoom: float, focus: float, done: Sequence[Le
         pixel_aspect=request.pixel_aspect,
         pivot_sigma_m=request.pivot_sigma_m,
         angle_sigma_deg=request.angle_sigma_deg,
-        nodal_offset_mm=nodal[-1] if nodal else 0.0,
-        nodal_sigma_mm=_NODAL_CHANGE_MM if nodal else 0.0,
+        nodal_offset_mm=nodal[-1] if nodal else request.nodal_offset_mm,
+        nodal_sigma_mm=max(_NODAL_CHANGE_MM, request.nodal_sigma_mm) if nodal else request.nodal_sigma_mm,
         guess=guess_from(done, zoom, request),
         neighbour=last_measured(done, request),
     )

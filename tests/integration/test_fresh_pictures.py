@@ -131,6 +131,7 @@ async def test_trap_2_an_output_that_grows_slower_is_noticed_and_waited_for() ->
         await taker.measure_delay()
         measured_s = taker.delay.delay_s
         studio.delay_s = measured_s + 0.02
+        await asyncio.sleep(studio.delay_s)  # an output that grows slower repeats pictures, it does not go back
         for capture in captures(20):
             taken = await taker.take(capture)
             assert taken.frozen or studio.shows(taken), capture

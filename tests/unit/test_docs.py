@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
 
 from app.documents import JobRequest, PictureSet
 from storage.schemas import document_to_table, table_to_document
@@ -113,18 +112,6 @@ def test_lens_table_examples_are_accepted() -> None:
     for example in _examples("reference/lens-table.md"):
         table = document_to_table(json.loads(example))
         assert table_to_document(table)["levels"]
-
-
-@pytest.mark.parametrize(("name", "model"), [("job", JobRequest), ("picture-set", PictureSet)])
-def test_schemas_are_those_of_the_models(name: str, model: type[BaseModel]) -> None:
-    """Where this fails after a change of a model, write ``schema_text`` of it to the file."""
-    file = REPOSITORY / "docs" / "reference" / f"{name}.schema.json"
-    assert file.read_text("utf-8") == schema_text(model)
-
-
-def schema_text(model: type[BaseModel]) -> str:
-    """The model's JSON Schema as it stands in the documentation."""
-    return json.dumps(model.model_json_schema(), indent=1, sort_keys=True) + "\n"
 
 
 def test_fences_say_only_what_is_known() -> None:
