@@ -13,7 +13,8 @@ from app.jobs.cpu import Cpu
 from calibration.detect.target import find_target
 from calibration.errors import CalibrationError, InvalidInput
 from calibration.image import Transfer, decode_picture
-from calibration.solve.level import LevelFit, held_out_residuals, solve_level
+from calibration.solve.iteration import LevelFit
+from calibration.solve.level import held_out_residuals, solve_level
 from calibration.solve.outcome import level_result, shift_only_result
 from calibration.solve.problem import View
 from calibration.tables import Frames, LeftOut, LensTable, LevelResult, LevelStatus

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from calibration.compare import Overlay, predicted_overlay
 from calibration.lens import Lens
-from calibration.solve.level import LevelFit
+from calibration.solve.iteration import LevelFit
 from calibration.tables import LensTable, LevelResult, LevelStatus
 from storage.records import PictureKind
 

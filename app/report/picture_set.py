@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from app.jobs.pictures import jpeg, residual_picture
 from app.picture_sets import SetLevel
 from app.report.model import LevelReport, RunReport
-from calibration.solve.level import LevelFit
+from calibration.solve.iteration import LevelFit
 from calibration.tables import LensTable
 from storage.records import PictureKind
 

@@ -16,7 +16,8 @@ from calibration.camera import project_points, target_points_world
 from calibration.compare import predicted_overlay
 from calibration.errors import CalibrationError, NotEnoughData
 from calibration.lens import Lens
-from calibration.solve.level import LevelFit, held_out_residuals, solve_level
+from calibration.solve.iteration import LevelFit
+from calibration.solve.level import held_out_residuals, solve_level
 from calibration.solve.outcome import level_result, pixel_error
 from calibration.solve.problem import View
 from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at, expected_points

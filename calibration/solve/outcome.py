@@ -10,7 +10,8 @@ import numpy as np
 from calibration.camera import target_points_world, world_to_camera
 from calibration.compare import NEGLIGIBLE_PX, edge_effect_px, predicted_overlay
 from calibration.solve.center_shift import center_shift_from_centre
-from calibration.solve.level import LevelFit
+from calibration.solve.iteration import LevelFit
+from calibration.solve.level import MISFIT_PX
 from calibration.solve.problem import View
 from calibration.tables import (
     EVIDENCE_QUANTITIES,
@@ -116,6 +117,12 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
                 "target at another distance"
             )
         trouble.append(f"expected overlay error up to {expected_max_px:.1f} px: {advice}")
+    if fit.floor_px > MISFIT_PX:
+        worst = max(fit.views, key=lambda view: view.rms_px)
+        trouble.append(
+            f"residuals of {fit.rms_px:.1f} px are far above what the pictures' noise explains (most in {worst.name}): "
+            "a pose, the survey or the target's size is wrong"
+        )
     if fit.untold:
         trouble.append(f"not told by the pictures: {', '.join(fit.untold)}")
     if fit.nodal_seen_mm is not None and not fit.nodal_told:

@@ -11,7 +11,8 @@ from calibration.camera import camera_rotation, rays_of
 from calibration.compare import overlay, predicted_overlay
 from calibration.errors import FoldedLens, InvalidInput, NotEnoughData
 from calibration.lens import Lens
-from calibration.solve.level import LevelFit, held_out_residuals, residual_of, solve_level
+from calibration.solve.iteration import LevelFit
+from calibration.solve.level import held_out_residuals, residual_of, solve_level
 from calibration.solve.problem import Problem, View
 from calibration.solve.start import start
 from calibration.synthetic import observe
@@ -246,3 +247,25 @@ def test_a_pupil_off_the_pivot_is_measured_where_the_pictures_contradict_the_giv
     assert not given.nodal_told
     assert given.lens.nodal_offset_mm == 120.0
     assert predicted_overlay(given.lens, given.covariance).max_px < predicted_overlay(fit.lens, fit.covariance).max_px
+
+
+def test_one_wrong_pose_among_few_pictures_is_found_out() -> None:
+    """Four pictures, one pan angle 0.3 degrees off and said to be exact: the lens bends to suit it, and no point is out."""
+    views = [v for v, angle in zip(posed_views(WIDE, np.random.default_rng(16)), ANGLES, strict=True) if angle[0]][:4]
+    assert views[1].camera_pose is not None
+    wrong = replace(views[1].camera_pose, pan_deg=views[1].camera_pose.pan_deg + 0.3)
+    fit = solve_level([views[0], replace(views[1], camera_pose=wrong), *views[2:]], SIZE)
+    assert [name for name, _ in fit.dropped] == [views[1].name]
+    assert "contradicts the other pictures" in fit.dropped[0][1]
+
+
+def test_boards_that_all_face_the_camera_do_not_tell_a_lens() -> None:
+    rng = np.random.default_rng(17)
+    flat = []
+    for x, z in ((-1.5, 0.9), (1.5, 2.2)):
+        board = replace(BOARD, square_m=0.05, pose=TargetPose((x, 5.0, z)))
+        seen = observe(WIDE, CameraPose((0.0, 0.0, 1.6)), board, rng, 0.05)
+        assert isinstance(seen, Detection)
+        flat.append(View(f"{x}", "board", replace(board, pose=None), seen))
+    with pytest.raises(NotEnoughData, match="different angles"):
+        solve_level(flat, SIZE)

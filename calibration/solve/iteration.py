@@ -1,0 +1,322 @@
+"""The iteration of a level's fit: damped Gauss-Newton, robust start, noise floor, outliers, and what it leaves.
+
+Levenberg-Marquardt damping on whitened residuals. The variance of a point is its detection's covariance plus one
+common floor (``floor_px``) for what the model does not describe (a board that is not flat, an edge that is not
+straight): the floor is chosen so that chi2 equals the degrees of freedom (variance component estimation), so that
+uncertainties stay true where the detector's own are too small to be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import NotConverged, NotEnoughData
+from calibration.lens import Lens
+from calibration.solve.problem import LENS_COUNT, PRIOR_NODAL_MM, Evaluation, Problem, State, View
+from calibration.solve.start import FreePoses
+from calibration.types import FloatArray
+
+_ITERATIONS = 200
+# Boards that all face the camera leave a valley along which the fit creeps; all else needs ten to twenty.
+_CONVERGED_PX = 1e-7
+# A step that moves no point by more than this is the end: five orders below the best detector.
+_OUTLIER_CHI2 = 25.0
+# Squared distance over its variance, 2 degrees of freedom: 5 sigma, one point in 270,000.
+_VIEW_OUTLIERS = 0.3
+# A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
+_FLOOR_ROUNDS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewResidual:
+    """One picture's residuals: model minus picture (N, 2) px, which points counted, RMS per coordinate and maximum."""
+
+    name: str
+    target_name: str
+    points_px: FloatArray
+    residual_px: FloatArray
+    used: NDArray[np.bool_]
+    rms_px: float
+    max_px: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LevelFit:
+    """A level's lens with its evidence.
+
+    ``covariance`` (5, 5) is of (f_px, k1, k2, sx, sy) as :data:`calibration.lens.LENS_PARAMETERS`. ``rms_px`` is per
+    coordinate, ``max_px`` a distance, both over the points that counted. ``floor_px`` see the module.
+    ``outliers``: (picture, point number, distance px); ``dropped``: pictures left out with their reasons.
+    ``poses``: camera from target (R, t in metres) of each free picture, by name. ``untold`` names the quantities
+    (``k1``, ``k2``, ``center_shift_px``) that the pictures do not show: they are held at 0 in ``lens``, while
+    ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
+    pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
+    stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
+    """
+
+    lens: Lens
+    covariance: FloatArray
+    floor_px: float
+    rms_px: float
+    max_px: float
+    points: int
+    views: tuple[ViewResidual, ...]
+    outliers: tuple[tuple[str, int, float], ...]
+    dropped: tuple[tuple[str, str], ...]
+    poses: dict[str, tuple[FloatArray, FloatArray]]
+    iterations: int
+    untold: tuple[str, ...] = ()
+    sigma_nodal_mm: float | None = None
+    nodal_told: bool = False
+    nodal_seen_mm: tuple[float, float] | None = None
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of (f_px, k1, k2, sx, sy), shape (5,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def sigma_fov_x_deg(self) -> float:
+        """d fov_x / d f = -2 (W/2) / (f^2 + (W/2)^2), radians per px."""
+        half = self.lens.image_size[0] / 2
+        return math.degrees(2 * half / (self.lens.f_px**2 + half**2)) * float(self.sigma[0])
+
+
+class Fit:
+    """One run of the iteration over one set of views."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        lens: Lens,
+        poses: FreePoses,
+        *,
+        lens_free: bool = True,
+        held: tuple[str, ...] = (),
+        nodal_sigma_mm: float = PRIOR_NODAL_MM,
+    ) -> None:
+        self.problem = Problem(views, lens, poses, lens_free=lens_free, held=held, nodal_sigma_mm=nodal_sigma_mm)
+        self.state: State = self.problem.state
+        self.detector_px2 = np.concatenate([v.detection.covariance_px2 for v in views])
+        self.used = np.ones(len(self.detector_px2), dtype=bool)
+        self.floor_px = 0.0
+        self.iterations = 0
+
+    def free_poses(self) -> FreePoses:
+        """The poses that were free, as they now stand."""
+        return {index: (pose.R_ct, pose.t_ct_m) for index, pose in self.state.free.items()}
+
+    def run(self) -> None:
+        """Robust start, then rounds of: floor from the residuals, outliers by it, fit."""
+        self.floor_px = 1.0
+        self.iterate(robust=True)
+        for _ in range(_FLOOR_ROUNDS):
+            before = self.floor_px, self.used.copy()
+            residual = self.problem.evaluate(self.state, jacobian=False).residual_px
+            self.floor_px = self._robust_floor(residual)
+            self._reject(residual)
+            self.iterate(robust=False)
+            if abs(self.floor_px - before[0]) <= 0.01 * before[0] + 1e-6 and np.array_equal(self.used, before[1]):
+                break
+        self.floor_px = self._floor_for_chi2()
+        self.iterate(robust=False)
+
+    def iterate(self, *, robust: bool) -> None:
+        """Gauss-Newton with Levenberg-Marquardt damping until no point moves; raises NotConverged."""
+        damping = 1e-4
+        whiten = self._whitening()
+        evaluation = self.problem.evaluate(self.state)
+        cost = self._cost(evaluation, whiten, robust)
+        if not math.isfinite(cost):
+            raise NotEnoughData("the start puts points where no lens draws; give a guess for the field of view")
+        moved = math.inf
+        for _ in range(_ITERATIONS):
+            self.iterations += 1
+            matrix, gradient = self._normal_equations(evaluation, whiten, robust)
+            for _ in range(12):
+                scale = np.diag(matrix).copy()
+                scale[scale <= 0] = 1.0
+                try:
+                    step = np.asarray(np.linalg.solve(matrix + damping * np.diag(scale), -gradient), dtype=np.float64)
+                except np.linalg.LinAlgError:
+                    damping = max(damping, 1e-6) * 10
+                    continue
+                trial = self.problem.stepped(self.state, step)
+                trial_evaluation = self.problem.evaluate(trial)
+                trial_cost = self._cost(trial_evaluation, whiten, robust)
+                if math.isfinite(trial_cost) and trial_cost <= cost * (1 + 1e-12):
+                    break
+                damping = max(damping, 1e-6) * 10
+            else:
+                return  # no step makes it better: this is the minimum, to rounding
+            difference = trial_evaluation.residual_px - evaluation.residual_px
+            moved = float(np.nanmax(np.abs(difference[self.used])))
+            gained = cost - trial_cost
+            self.state, evaluation, cost = trial, trial_evaluation, trial_cost
+            damping = max(damping / 10, 1e-12)
+            if moved < _CONVERGED_PX or (robust and gained < 1e-6 * (1 + cost)):
+                return
+        if moved > 1e-3 and not robust:
+            raise NotConverged("the level's fit", _ITERATIONS, moved)
+
+    def _whitening(self) -> FloatArray:
+        """(N, 2, 2) matrices W with W^T W = inverse covariance of each point; zero for points that do not count."""
+        covariance = self.detector_px2 + np.eye(2) * self.floor_px**2
+        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        return np.asarray(np.where(self.used[:, None, None], whiten, 0.0))
+
+    def _robust_weights(self, whitened: FloatArray) -> FloatArray:
+        # Cauchy: far points pull ever less, so a start with a few wrong ones still converges.
+        return np.asarray(1.0 / (1.0 + np.sum(whitened**2, axis=1) / 4.0))
+
+    def _cost(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> float:
+        whitened = (whiten @ evaluation.residual_px[..., None])[..., 0]
+        whitened = np.where(self.used[:, None], whitened, 0.0)
+        squares = np.sum(whitened**2, axis=1)
+        data = float(np.sum(4.0 * np.log1p(squares / 4.0))) if robust else float(np.sum(squares))
+        return data + float(np.sum(evaluation.prior_residual**2))
+
+    def _normal_equations(
+        self, evaluation: Evaluation, whiten: FloatArray, robust: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        whitened = (whiten @ evaluation.residual_px[..., None])[..., 0][self.used]
+        J = (whiten @ evaluation.jacobian)[self.used]
+        if robust:
+            root = np.sqrt(self._robust_weights(whitened))
+            whitened, J = whitened * root[:, None], J * root[:, None, None]
+        flat = J.reshape(-1, J.shape[-1])
+        prior = evaluation.prior_jacobian
+        matrix = flat.T @ flat + prior.T @ prior
+        return matrix, flat.T @ whitened.ravel() + prior.T @ evaluation.prior_residual
+
+    def _degrees_of_freedom(self) -> int:
+        # Unknowns with a prior bring one observation each, so they take nothing from the points.
+        priors = self.problem.evaluate(self.state, jacobian=False).prior_residual.size
+        with_prior = priors - self.problem.weak_priors
+        return max(2 * int(self.used.sum()) - (self.problem.count - with_prior), 1)
+
+    def _robust_floor(self, residual: FloatArray) -> float:
+        """The floor that explains the residuals but for gross errors.
+
+        Scatter from the 90th percentile (Gaussian: 1.645 sigma) of the coordinates within ten times the scatter that
+        the median tells: half the points may be grossly wrong, yet the long tails of a bent board still count.
+        """
+        finite = np.abs(residual[np.isfinite(residual).all(axis=1)])
+        if len(finite) == 0:
+            raise NotEnoughData("the lens found cannot draw any point; check the target's size and pose")
+        gross = 10 * float(np.median(finite)) / 0.6745 + 1e-12
+        scatter = float(np.quantile(finite[finite <= gross], 0.9)) / 1.645
+        scatter *= math.sqrt(2 * len(finite) / max(2 * len(finite) - self.problem.count, len(finite) * 0.2))
+        own = float(np.median(np.trace(self.detector_px2, axis1=1, axis2=2)) / 2)
+        return math.sqrt(max(scatter**2 - own, 0.0))
+
+    def _floor_for_chi2(self) -> float:
+        """The floor at which chi2 equals the degrees of freedom (0 if it is below them without one); bisection."""
+        residual = self.problem.evaluate(self.state, jacobian=False).residual_px[self.used]
+        covariance = self.detector_px2[self.used]
+        goal = self._degrees_of_freedom()
+
+        def chi2(floor: float) -> float:
+            total = covariance + np.eye(2) * floor**2
+            solved = np.linalg.solve(total, residual[..., None])[..., 0]
+            return float(np.sum(residual * solved))
+
+        if chi2(0.0) <= goal:
+            return 0.0
+        low, high = 0.0, 10 * float(np.sqrt(np.mean(residual**2))) + 1e-9
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if chi2(middle) > goal else (low, middle)
+        return high
+
+    def _distance2(self, residual: FloatArray) -> FloatArray:
+        covariance = self.detector_px2 + np.eye(2) * self.floor_px**2
+        safe = np.where(np.isfinite(residual), residual, 1e6)
+        return np.asarray(np.sum(safe * np.linalg.solve(covariance, safe[..., None])[..., 0], axis=1))
+
+    def _reject(self, residual: FloatArray) -> None:
+        self.used = self._distance2(residual) <= _OUTLIER_CHI2
+        if self.used.sum() * 2 < self.problem.count + 2:
+            raise NotEnoughData("most points disagree with any lens; check the target's size, its pose and the angles")
+
+    def worst_view(self) -> tuple[int, str] | None:
+        """(index, reason) of the picture with most outliers, if it is to be dropped."""
+        residual = self.problem.evaluate(self.state, jacobian=False).residual_px
+        worst: tuple[int, float] | None = None
+        for index in range(len(self.problem.views)):
+            share = 1 - float(np.mean(self.used[self.problem.view_of == index]))
+            if share > _VIEW_OUTLIERS and (worst is None or share > worst[1]):
+                worst = index, share
+        if worst is None:
+            return None
+        distance = np.median(np.linalg.norm(residual[self.problem.view_of == worst[0]], axis=1))
+        return worst[0], f"{worst[1]:.0%} of its points disagree with the other pictures (median {distance:.1f} px)"
+
+    def result(self, dropped: tuple[tuple[str, str], ...]) -> LevelFit:
+        evaluation = self.problem.evaluate(self.state)
+        whiten = self._whitening()
+        matrix, _ = self._normal_equations(evaluation, whiten, False)
+        lens = self.state.lens
+        inverse = _inverse(matrix)
+        covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
+        column = self.problem.nodal_column
+        residual = evaluation.residual_px
+        whitened = (whiten @ residual[..., None])[..., 0]
+        views, outliers = [], []
+        for index, view in enumerate(self.problem.views):
+            rows = self.problem.view_of == index
+            used = self.used[rows]
+            counted = residual[rows][used]
+            distance = np.linalg.norm(residual[rows], axis=1)
+            views.append(
+                ViewResidual(
+                    view.name,
+                    view.target_name,
+                    view.detection.points_px,
+                    residual[rows],
+                    used,
+                    float(np.sqrt(np.mean(counted**2))) if len(counted) else math.nan,
+                    float(np.max(distance[used])) if used.any() else math.nan,
+                    float(np.sum(whitened[rows] ** 2)) / max(2 * int(used.sum()), 1),
+                )
+            )
+            ids = view.detection.point_ids
+            outliers += [(view.name, int(ids[i]), float(distance[i])) for i in np.flatnonzero(~used)]
+        counted = residual[self.used]
+        return LevelFit(
+            lens=lens,
+            covariance=covariance,
+            floor_px=self.floor_px,
+            rms_px=float(np.sqrt(np.mean(counted**2))),
+            max_px=float(np.max(np.linalg.norm(counted, axis=1))),
+            points=int(self.used.sum()),
+            views=tuple(views),
+            outliers=tuple(outliers),
+            dropped=dropped,
+            poses={self.problem.views[i].name: (p.R_ct, p.t_ct_m) for i, p in self.state.free.items()},
+            iterations=self.iterations,
+            sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
+        )
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of the normal matrix (P, P), its columns first scaled to like size: pixels stand beside millimetres."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return np.asarray(np.linalg.pinv(matrix * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
+
+
+def _to_lens_parameters(lens: Lens, covariance: FloatArray) -> FloatArray:
+    """Covariance of (log f, k1_hw, k2_hw, sx, sy) to that of (f, k1, k2, sx, sy)."""
+    h = lens.half_width
+    T = np.zeros((5, 5))
+    T[0, 0] = lens.f_px
+    T[1, 0], T[1, 1] = 2 * lens.k1, 1 / h**2
+    T[2, 0], T[2, 2] = 4 * lens.k2, 1 / h**4
+    T[3, 3] = T[4, 4] = 1.0
+    return np.asarray(T @ covariance @ T.T)
