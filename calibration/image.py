@@ -70,9 +70,7 @@ def decode_picture(data: bytes, *, expected_size: tuple[int, int] | None = None)
     if width * height > MAX_PICTURE_PIXELS or width < 1 or height < 1:
         raise InvalidInput("picture size", f"{width}x{height}", f"at most {MAX_PICTURE_PIXELS} pixels are read")
     if expected_size is not None and (width, height) != expected_size:
-        raise InvalidInput(
-            "picture size", f"{width}x{height}", f"the set is {expected_size[0]}x{expected_size[1]}; left out"
-        )
+        raise InvalidInput("picture size", f"{width}x{height}", f"expected {expected_size[0]}x{expected_size[1]}")
     # The pixels as stored are what the lens drew: an EXIF turn would move the principal point.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.camera import project_points, target_points_world
 from calibration.compare import predicted_overlay
-from calibration.errors import CalibrationError, NotEnoughData
+from calibration.errors import CalibrationError, InvalidInput, NotEnoughData
 from calibration.lens import Lens
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, solve_level
@@ -22,7 +22,7 @@ from calibration.solve.outcome import level_result, pixel_error
 from calibration.solve.problem import View
 from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at, expected_points
 from calibration.tables import LeftOut, LevelResult, PixelError
-from calibration.types import Detection, FloatArray, Refusal, Role, Target
+from calibration.types import Detection, FloatArray, Refusal, Role, Target, TargetKind
 
 _PLACES: tuple[tuple[float, float, Role], ...] = (
     (1.0, 1.0, Role.K2),
@@ -73,6 +73,11 @@ class JointMethod:
     def __init__(self, task: LevelTask, options: JointOptions | None = None) -> None:
         self._task = task
         self._options = options or JointOptions()
+        self._names = [name for name, target in task.targets.items() if target.kind is not TargetKind.LIGHT]
+        if not self._names:
+            raise InvalidInput(
+                "targets", sorted(task.targets), "a level needs a board or a square; a light tells no lens"
+            )
         self._stage = _Stage.PROBE
         self._steps = 0
         self._pending: dict[int, Capture] = {}
@@ -148,10 +153,10 @@ class JointMethod:
     def _probe_order(self) -> list[str]:
         """The target that should fill the picture best first, then smaller ones (the view may be narrower), then the
         rest; without any idea of the view, as they were surveyed."""
-        names = list(self._task.targets)
+        names = self._names
         near = self._task.guess or self._task.neighbour
         if near is None:
-            return names
+            return list(names)
         best = self._best_target(near)
         share = {name: self._share(near, self._task.targets[name]) for name in names}
         smaller = sorted((n for n in names if share[n] < share[best]), key=share.__getitem__, reverse=True)
@@ -198,7 +203,7 @@ class JointMethod:
 
     def _best_target(self, lens: Lens) -> str:
         """The target that fills most of the picture without taking more than ``fill`` of its height."""
-        sizes = {name: self._share(lens, target) for name, target in self._task.targets.items()}
+        sizes = {name: self._share(lens, self._task.targets[name]) for name in self._names}
         fitting = {name: share for name, share in sizes.items() if share <= self._options.fill}
         return max(fitting, key=fitting.__getitem__) if fitting else min(sizes, key=sizes.__getitem__)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from calibration.compare import overlay
-from calibration.errors import NotEnoughData
+from calibration.errors import InvalidInput, NotEnoughData
 from calibration.lens import Lens
 from calibration.solve.joint import JointMethod
 from calibration.solve.search import Capture, LevelTask, Observation, Source
@@ -128,3 +129,13 @@ def test_an_unreadable_render_leaves_the_level_usable_with_the_reason() -> None:
     )
     assert result.engine_overlay_px is None
     assert "black" in result.reasons["engine_overlay_px"]
+
+
+def test_a_light_is_never_looked_for_and_alone_is_refused() -> None:
+    light = {"light": Target(TargetKind.LIGHT, diameter_m=0.01, pose=TargetPose((0.0, 5.0, 1.6)))}
+    truth = lens(8, 0.03, 0.0)
+    level = replace(task(), targets={**light, **TARGETS})
+    _, captures = drive(JointMethod(level), truth, level)
+    assert {capture.target for capture in captures} <= set(TARGETS)
+    with pytest.raises(InvalidInput, match="a board or a square"):
+        JointMethod(replace(level, targets=light))
