@@ -7,6 +7,7 @@ import contextlib
 import json
 import random
 import socket
+import tomllib
 from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import httpx
 import pytest
 import uvicorn
+from fastapi import FastAPI
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
@@ -135,6 +137,16 @@ async def received(client: ClientConnection, until: Callable[[dict[str, Any]], b
 
 def seqs(events: list[Any]) -> list[int]:
     return [event["seq"] for event in events if event["kind"] != "heartbeat"]
+
+
+def test_trap_5_the_server_has_what_it_needs_to_accept_sockets(repository: Path, tmp_path: Path) -> None:
+    """``uvicorn`` by itself answers a socket's request with 404: the package that it needs is a dependency of ours."""
+    dependencies = tomllib.loads((repository / "pyproject.toml").read_text("utf-8"))["project"]["dependencies"]
+    assert any(dependency.startswith("websockets>=") for dependency in dependencies)
+    settings = Settings(database=tmp_path / "lensmatch.db")
+    config = server_config(FastAPI(), settings)
+    config.load()
+    assert config.ws_protocol_class is not None
 
 
 async def test_replay_then_live_then_a_normal_end(studio: Studio) -> None:

@@ -1,4 +1,4 @@
-"""Two traps of a running job: a picture that still shows the old value, and pictures decoded on the event loop."""
+"""Two traps of a running job: a picture that still shows the old value, and numerics on the event loop."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ from app.engines import Studio
 from app.jobs import taking
 from app.jobs.cpu import Cpu
 from app.jobs.freshness import OutputDoesNotFollow
+from app.jobs.level import LevelRun
 from app.jobs.taking import PictureTaker
-from calibration.solve.search import Capture, Source
+from calibration.image import Transfer
+from calibration.solve.search import Capture, LevelTask, Observation, Source
+from calibration.tables import LevelResult
+from calibration.types import Target, TargetKind, TargetPose
 from engine_adapters.ports import EncodedFrame, EngineState, HeadState, LensValues, Shown, TrackedCamera
 
 SIZE = (128, 72)
@@ -96,11 +100,46 @@ class DelayedStudio:
         return (pan, shown) == (100 + 8 * round(taken.capture.pan_deg), 60 * list(Shown).index(source))
 
 
+class NotingMethod:
+    """Asks for three pictures, and notes in which threads it works."""
+
+    def __init__(self) -> None:
+        self.threads: set[str] = set()
+        self._left = list(captures(3))
+        self._waiting = 0
+
+    def _note(self) -> None:
+        self.threads.add(threading.current_thread().name)
+
+    @property
+    def done(self) -> bool:
+        return not self._left and not self._waiting
+
+    @property
+    def progress(self) -> float:
+        return 0.0
+
+    def ask(self) -> Capture | None:
+        self._note()
+        if not self._left:
+            return None
+        self._waiting += 1
+        return self._left.pop(0)
+
+    def tell(self, observation: Observation) -> None:
+        self._note()
+        self._waiting -= 1
+
+    def result(self) -> LevelResult:
+        self._note()
+        return LevelResult.failed(0.5, 0.5, "nothing was solved")
+
+
 @contextlib.contextmanager
-def taking_from(studio: DelayedStudio) -> Iterator[PictureTaker]:
+def using(studio: DelayedStudio) -> Iterator[tuple[PictureTaker, Cpu]]:
     cpu = Cpu(2)
     try:
-        yield PictureTaker(Studio(studio, studio, studio), SIZE, cpu)
+        yield PictureTaker(Studio(studio, studio, studio), SIZE, cpu), cpu
     finally:
         cpu.close()
 
@@ -116,7 +155,7 @@ def captures(count: int) -> Iterator[Capture]:
 @pytest.mark.parametrize("delay_s", [0.0, 0.004, 0.02])
 async def test_trap_2_no_picture_is_taken_that_shows_the_value_before(delay_s: float) -> None:
     studio = DelayedStudio(delay_s)
-    with taking_from(studio) as taker:
+    with using(studio) as (taker, _):
         await taker.measure_delay()
         assert taker.delay.delay_s >= delay_s - PICTURE_S
         for capture in captures(60):
@@ -127,7 +166,7 @@ async def test_trap_2_no_picture_is_taken_that_shows_the_value_before(delay_s: f
 
 async def test_trap_2_an_output_that_grows_slower_is_noticed_and_waited_for() -> None:
     studio = DelayedStudio(0.004)
-    with taking_from(studio) as taker:
+    with using(studio) as (taker, _):
         await taker.measure_delay()
         measured_s = taker.delay.delay_s
         studio.delay_s = measured_s + 0.02
@@ -141,7 +180,7 @@ async def test_trap_2_an_output_that_grows_slower_is_noticed_and_waited_for() ->
 
 async def test_trap_2_an_output_that_stands_still_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     studio = DelayedStudio(0.0)
-    with taking_from(studio) as taker:
+    with using(studio) as (taker, _):
         await taker.measure_delay()
         studio.frozen = True
         first, second = captures(2)
@@ -152,7 +191,9 @@ async def test_trap_2_an_output_that_stands_still_is_told(monkeypatch: pytest.Mo
             await taker.measure_delay()
 
 
-async def test_trap_6_pictures_are_decoded_off_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_trap_6_pictures_are_decoded_and_searched_and_levels_solved_off_the_event_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     threads: dict[str, set[str]] = {}
 
     def noted(name: str) -> None:
@@ -164,12 +205,19 @@ async def test_trap_6_pictures_are_decoded_off_the_event_loop(monkeypatch: pytes
 
         monkeypatch.setattr(taking, name, work)
 
-    for name in ("decode_picture", "thumbnail"):
+    for name in ("decode_picture", "thumbnail", "find_target"):
         noted(name)
+    method = NotingMethod()
+    board = Target(TargetKind.CHESSBOARD, (5, 4), 0.1, colours=("black", "white"), pose=TargetPose((0.0, 5.0, 1.6)))
+    task = LevelTask(0.5, 0.5, SIZE, {"board": board}, (0.0, 0.0, 1.6))
+    told: list[str] = []
     studio = DelayedStudio(0.0)
-    with taking_from(studio) as taker:
+    with using(studio) as (taker, cpu):
         await taker.measure_delay()
-        for capture in captures(3):
-            await taker.take(capture)
-    assert set(threads) == {"decode_picture", "thumbnail"}
-    assert all(name.startswith("lensmatch-cpu") for names in threads.values() for name in names), threads
+        run = LevelRun(method, task, taker, cpu, Transfer.BT709, lambda kind, data: told.append(kind))
+        outcome = await run.run()
+    assert outcome.result.reason == "nothing was solved"
+    assert told.count("refused") == 3
+    assert threads.keys() == {"decode_picture", "thumbnail", "find_target"}
+    everywhere = method.threads.union(*threads.values())
+    assert all(name.startswith("lensmatch-cpu") for name in everywhere), everywhere

@@ -203,25 +203,37 @@ async def test_pictures_show_the_layers_after_the_delay(lens_file: Path) -> None
         r3(addresses) as line,
     ):
         assert (await fetch(addresses))[:20].any()
-        sent_s = time.monotonic()
-        await line.ask(f'{SCENE} "background.visible" SetValue "0"')
-        acknowledged_s = time.monotonic()
-        early = late = 0
-        while late < 2:
-            asked_s = time.monotonic()
-            picture = await fetch(addresses)
-            assert picture.any()
-            on_black = not picture[:20].any()
-            if time.monotonic() < sent_s + (delay - 1) * picture_time_s:
-                early += 1
-                assert not on_black
-            if asked_s > acknowledged_s + delay * picture_time_s:
-                late += 1
-                assert on_black
+        early = 0
+        for _ in range(10):  # on a busy machine the first picture may come too late to be an early one
+            await line.ask(f'{SCENE} "background.visible" SetValue "1"')
+            await asyncio.sleep((delay + 1) * picture_time_s)
+            early += await early_pictures(addresses, line, delay * picture_time_s, picture_time_s)
+            if early:
+                break
         assert early > 0
         await line.ask(f'{SCENE} "object.visible" SetValue "0"')
         await asyncio.sleep((delay + 1) * picture_time_s)
         assert not (await fetch(addresses)).any()
+
+
+async def early_pictures(addresses: dict[str, Any], line: Line, delay_s: float, picture_time_s: float) -> int:
+    """Switch the background off and check two pictures from after the delay; returns how many came before it."""
+    sent_s = time.monotonic()
+    await line.ask(f'{SCENE} "background.visible" SetValue "0"')
+    acknowledged_s = time.monotonic()
+    early = late = 0
+    while late < 2:
+        asked_s = time.monotonic()
+        picture = await fetch(addresses)
+        assert picture.any()
+        on_black = not picture[:20].any()
+        if time.monotonic() < sent_s + delay_s - picture_time_s:
+            early += 1
+            assert not on_black
+        if asked_s > acknowledged_s + delay_s:
+            late += 1
+            assert on_black
+    return early
 
 
 async def test_a_picture_takes_its_time_and_is_counted(lens_file: Path) -> None:
