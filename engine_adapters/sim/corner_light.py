@@ -13,14 +13,15 @@ cut after the second term: rho stays under 0.2 in any view in which a panel can 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from engine_adapters.sim.light import LightArray, light_of, light_of_colour
+from engine_adapters.sim.light import LightArray, code, light_of, light_of_colour, pack, unpack
 from engine_adapters.sim.optics import RayTable, View
-from engine_adapters.sim.panel_grid import PanelGrid
+from engine_adapters.sim.panel_grid import PanelGrid, grid_of
 from engine_adapters.sim.room import Panel
 
 FloatArray = NDArray[np.float64]
@@ -72,6 +73,11 @@ class _Steps:
         return result
 
 
+@lru_cache(maxsize=256)
+def _steps(panel: Panel, axis: int, neighbours: int) -> _Steps:
+    return _Steps(panel, axis, grid_of(panel).edges[axis], neighbours)
+
+
 class CornerLight:
     """Light of a panel's pixels in one view."""
 
@@ -93,14 +99,16 @@ class CornerLight:
         sigma_m = sigma_px * float(np.linalg.norm(centre)) / self._optics.f_px
         # An edge farther than 4.5 sigma from a pixel adds less than 1e-5; half a cell lies between it and the nearest.
         neighbours = math.ceil(max(0.0, 4.5 * sigma_m / nearest_m - 0.5))
-        self._steps = [_Steps(panel, axis, grid.edges[axis], neighbours) for axis in (0, 1)]
+        self._steps = [_steps(panel, axis, neighbours) for axis in (0, 1)]
         first, second = (light_of_colour(colour) for colour in panel.colours)
         margin = light_of_colour(panel.margin_colour) if panel.margin_m > 0.0 else np.zeros(3, dtype=np.float32)
         self._parts = np.stack([margin, (first + second) / 2.0 - margin, (first - second) / 2.0])
         self._covering = _PANEL if panel.margin_m > 0.0 else _AREA
 
-    def at(self, u: FloatArray, v: FloatArray, behind: NDArray[np.uint8]) -> tuple[LightArray, NDArray[np.bool_]]:
-        """Linear light (N, 3) at pixels over what lies ``behind`` them (N, 3 coded); which ones have a ray at all."""
+    def at(
+        self, u: FloatArray, v: FloatArray, behind: NDArray[np.uint32] | None
+    ) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
+        """Packed pixels (N,) over what lies ``behind`` them (N, packed; None: black); which ones have a ray at all."""
         x, y = self._table.rays(u, v)
         seen = np.isfinite(x)
         if not seen.all():
@@ -118,11 +126,11 @@ class CornerLight:
             product += rho * along_a[1] * along_b[1]
             product += (np.float32(0.5) * rho * rho) * along_a[2] * along_b[2]
         light = np.asarray(products.T @ self._parts, dtype=np.float32)
-        cover = products[self._covering]
-        open_pixels = np.flatnonzero(cover < np.float32(1.0 - 1e-5))
-        if len(open_pixels):
-            light[open_pixels] += light_of(behind[open_pixels]) * (np.float32(1.0) - cover[open_pixels, np.newaxis])
-        return light, seen
+        if behind is not None:
+            cover = products[self._covering]
+            beside = np.flatnonzero(cover < np.float32(1.0 - 1e-5))
+            light[beside] += light_of(unpack(behind[beside])) * (np.float32(1.0) - cover[beside, np.newaxis])
+        return pack(code(light)), seen
 
     def _spread(
         self, x: LightArray, y: LightArray, depth: LightArray, a: LightArray, b: LightArray

@@ -12,6 +12,7 @@ rather level are treated the same way with rows and columns changed over.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,149 +20,177 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from engine_adapters.sim.light import Colour, LightArray, code, light_of, light_of_colour, pack, unpack
+from engine_adapters.sim.light import Colour, blend, code, light_of_colour, pack
 from engine_adapters.sim.optics import View
 from engine_adapters.sim.panel_grid import BEHIND, PanelGrid
 from engine_adapters.sim.room import Panel
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]
+Words = NDArray[np.uint32]
+
+REACH_SIGMAS = 4.0
+"""Beyond this distance an edge adds nothing that the coded values could show (3e-5 of its step)."""
 
 _SAMPLES = 25
 _STEPS_PER_SIGMA = 512
-_REACH_SIGMAS = 4.0
 _LEAST_SLANT = 0.3
+_BLACK = (0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
 class _Crossings:
     """Where edges cross picture lines. ``line``: row (or column) number, ``at``: exact position along it, ``slant``:
     cosine to the line's normal, signed so that it is positive where the edge's far side lies at growing positions;
-    ``near``, ``far``: what the two sides show."""
+    ``sides``: what the two sides show, near * 4 + far."""
 
     line: IndexArray
     at: FloatArray
     slant: FloatArray
-    near: IndexArray
-    far: IndexArray
+    sides: IndexArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Strokes:
+    """Pixels to paint along crossings of one kind: pixel ``base + k * stride`` for k = -reach..reach, at a distance of
+    ``start + k * scale`` sigmas. ``border``: distance of the base from both ends of its line, None if all are inside.
+    """
+
+    base: IndexArray
+    stride: int
+    reach: int
+    start: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    sides: IndexArray
+    border: tuple[IndexArray, IndexArray] | None
+
+    def pixels(self) -> Iterator[tuple[IndexArray, NDArray[np.float32], IndexArray]]:
+        """Flat pixel numbers, their distances in sigmas, and what lies on their edge's sides, one k after another."""
+        for k in range(-self.reach, self.reach + 1):
+            where, distance, sides = self.base + k * self.stride, self.start + np.float32(k) * self.scale, self.sides
+            if self.border is not None:
+                inside = (self.border[0] + k >= 0) & (self.border[1] - k >= 0)
+                where, distance, sides = where[inside], distance[inside], sides[inside]
+            yield where, distance, sides
 
 
 class EdgeLight:
-    """The edges of one panel in one view."""
+    """The edges of one panel in one view, for a picture whose pixel (u, v) is word v * ``row`` + u."""
 
-    def __init__(self, view: View, panel: Panel, grid: PanelGrid, sigma_px: float, reach_px: float) -> None:
+    def __init__(self, view: View, panel: Panel, grid: PanelGrid, sigma_px: float, row: int) -> None:
         self._view = view
         self._panel = panel
         self._grid = grid
         self._sigma_px = sigma_px
-        self._reach_px = reach_px
-        axes = panel.axes
-        centre = view.to_camera(np.array([panel.centre_m]))[0]
-        self._origin = centre
-        self._along = axes[:2] @ view.axes.T
-
-    def draw(self, words: NDArray[np.uint32], behind: NDArray[np.uint32] | Colour) -> None:
-        """Draw the edges into packed pixels (H, W) over what lies ``behind``: a picture like it, or one colour."""
-        picture_behind = behind if isinstance(behind, np.ndarray) else None
-        behind_colour = (0, 0, 0) if isinstance(behind, np.ndarray) else behind
-        table = _profile_table((behind_colour, self._panel.margin_colour, *self._panel.colours))
+        self._row = row
+        self._reach_px = REACH_SIGMAS * sigma_px + 1.0
+        self._origin = view.to_camera(np.array([panel.centre_m]))[0]
+        self._along = panel.axes[:2] @ view.axes.T
+        self.painted_px = REACH_SIGMAS * sigma_px
+        """How far from an edge pixels are painted at most."""
+        self._plain: list[_Strokes] = []
+        self._open: list[_Strokes] = []
         for axis in (0, 1):
-            for upright in (True, False):
-                found = self._crossings(axis, upright)
-                if found is not None:
-                    self._paint(words, found, upright, table, picture_behind)
+            for upright, found in self._crossings(axis):
+                beside = (found.sides < 4) | (found.sides % 4 == BEHIND)
+                for strokes, chosen in ((self._open, beside), (self._plain, ~beside)):
+                    if chosen.any():
+                        strokes.append(self._strokes(found, chosen, upright))
 
-    def _paint(
-        self,
-        words: NDArray[np.uint32],
-        found: _Crossings,
-        upright: bool,
-        table: NDArray[np.uint32],
-        behind: NDArray[np.uint32] | None,
-    ) -> None:
-        height, width = words.shape
-        length, line_stride, step_stride = (width, width, 1) if upright else (height, 1, width)
-        reach = math.ceil(self._reach_px / float(np.abs(found.slant).min()))
-        offsets = np.arange(-reach, reach + 1)
-        nearest = np.rint(found.at).astype(np.intp)
-        positions = nearest[:, np.newaxis] + offsets
-        z = ((offsets - (found.at - nearest)[:, np.newaxis]) * (found.slant / self._sigma_px)[:, np.newaxis]).astype(
-            np.float32
-        )
-        flat = found.line[:, np.newaxis] * line_stride + positions * step_stride
-        inside = np.abs(z) <= _REACH_SIGMAS
-        if nearest.min() < reach or nearest.max() >= length - reach:
-            inside &= (positions >= 0) & (positions < length)
-        pixels = words.reshape(-1)
-        over_behind = (found.near == BEHIND) | (found.far == BEHIND)
-        known = np.ones_like(over_behind) if behind is None else ~over_behind
-        index = (np.clip(z, -_REACH_SIGMAS, _REACH_SIGMAS) * np.float32(_STEPS_PER_SIGMA)).round().astype(np.intp)
-        index += (found.near * 4 + found.far)[:, np.newaxis] * table.shape[1] + table.shape[1] // 2
-        chosen = inside & known[:, np.newaxis]
-        pixels[flat[chosen]] = table.reshape(-1)[index[chosen]]
-        if behind is None or not over_behind.any():
+    def draw(self, words: Words, behind: list[Words] | None) -> None:
+        """Draw the edges into packed pixels over what :meth:`behind` found, or over black."""
+        table = _profile_table((_BLACK, self._panel.margin_colour, *self._panel.colours))
+        half, row = table.shape[1] // 2, table.shape[1]
+        flat_table = table.reshape(-1)
+        for strokes in self._plain if behind is not None else [*self._plain, *self._open]:
+            for where, distance, sides in strokes.pixels():
+                index = distance * np.float32(_STEPS_PER_SIGMA) + np.float32(half + 0.5)
+                index = np.minimum(np.maximum(index, np.float32(0), out=index), np.float32(row - 1), out=index)
+                words[where] = flat_table.take(index.astype(np.intp) + sides * row)
+        if behind is None:
             return
-        chosen = inside & over_behind[:, np.newaxis]
-        rows = np.nonzero(chosen)[0]
-        share = ndtr(z[chosen])[:, np.newaxis]
-        where = flat[chosen]
-        far_behind = (found.far == BEHIND)[rows]
-        share[far_behind] = 1 - share[far_behind]
-        shown = np.where(found.near == BEHIND, found.far, found.near)[rows]
-        lights = self._lights()[shown]
-        under = light_of(unpack(behind.reshape(-1)[where]))
-        pixels[where] = pack(code(under + (lights - under) * share))
+        lights = np.stack([light_of_colour(colour) for colour in (_BLACK, self._panel.margin_colour, *self._panel.colours)])
+        unders = iter(behind)
+        for strokes in self._open:
+            for where, distance, sides in strokes.pixels():
+                near, far = sides >> 2, sides & 3
+                share = ndtr(np.where(near == BEHIND, distance, -distance))
+                words[where] = blend(next(unders), lights[near + far], share)
 
-    def _lights(self) -> LightArray:
-        panel = self._panel
-        colours = ((0, 0, 0), panel.margin_colour, *panel.colours)
-        return np.stack([light_of_colour(colour) for colour in colours])
+    def behind(self, words: Words) -> list[Words]:
+        """What now stands in the picture where the panel's outermost edges will be drawn."""
+        return [words[where] for strokes in self._open for where, _, _ in strokes.pixels()]
 
-    def _crossings(self, axis: int, upright: bool) -> _Crossings | None:
-        """Where the edges across ``axis`` that run upright (or level) cross picture rows (or columns)."""
+    def _strokes(self, found: _Crossings, chosen: NDArray[np.bool_], upright: bool) -> _Strokes:
         width, height = self._view.optics.image_size
-        lines_in_picture, length = (height, width) if upright else (width, height)
+        length, line_stride, stride = (width, self._row, 1) if upright else (height, 1, self._row)
+        line, at, slant, sides = (part[chosen] for part in (found.line, found.at, found.slant, found.sides))
+        reach = math.floor(REACH_SIGMAS * self._sigma_px / float(np.abs(slant).min()) + 0.5)
+        self.painted_px = max(self.painted_px, (reach + 0.5) * float(np.abs(slant).max()))
+        nearest = np.rint(at).astype(np.intp)
+        scale = slant * (1.0 / self._sigma_px)
+        start = ((nearest - at) * scale).astype(np.float32)
+        after = length - 1 - nearest
+        within = nearest.min() >= reach and after.min() >= reach
+        base = line * line_stride + nearest * stride
+        border = None if within else (nearest, after)
+        return _Strokes(base, stride, reach, start, scale.astype(np.float32), sides, border)
+
+    def _crossings(self, axis: int) -> Iterator[tuple[bool, _Crossings]]:
+        """Where the edges across ``axis`` cross picture rows (those that run upright) or columns (the others)."""
         edges, others = self._grid.edges[axis], self._grid.edges[1 - axis]
         samples = np.linspace(others[0], others[-1], _SAMPLES)
-        fixed, running = np.repeat(edges, _SAMPLES), np.tile(samples, len(edges))
-        camera = self._origin + np.outer(fixed, self._along[axis]) + np.outer(running, self._along[1 - axis])
-        paths = self._view.to_pixels(camera).reshape(len(edges), _SAMPLES, 2)
+        camera = (self._origin + np.outer(edges, self._along[axis]))[:, np.newaxis] + np.outer(
+            samples, self._along[1 - axis]
+        )
+        paths = self._view.to_pixels(camera.reshape(-1, 3)).reshape(len(edges), _SAMPLES, 2)
         travel = np.abs(paths[:, -1] - paths[:, 0])
         runs_upright = travel[:, 1] >= travel[:, 0]
+        for upright, chosen in ((True, runs_upright), (False, ~runs_upright)):
+            numbers = np.flatnonzero(chosen)
+            if len(numbers):
+                found = self._crossings_of(axis, upright, numbers, paths[numbers], samples)
+                if found is not None:
+                    yield upright, found
+
+    def _crossings_of(
+        self, axis: int, upright: bool, numbers: IndexArray, paths: FloatArray, samples: FloatArray
+    ) -> _Crossings | None:
+        """The crossings of the edges ``numbers``, which pass ``paths`` (edges, samples, 2) at ``samples``."""
+        width, height = self._view.optics.image_size
+        lines, length = (height, width) if upright else (width, height)
         along = 1 if upright else 0
-        chosen_lines, chosen_guess, chosen_edge = [], [], []
-        for number in np.flatnonzero(runs_upright == upright):
-            path, across = paths[number, :, along], paths[number, :, 1 - along]
-            if across.max() < -self._reach_px or across.min() > length - 1 + self._reach_px:
-                continue
-            order = path if path[-1] >= path[0] else path[::-1]
-            first, last = max(0, math.ceil(order[0])), min(lines_in_picture - 1, math.floor(order[-1]))
-            if first > last:
-                continue
-            numbers = np.arange(first, last + 1)
-            chosen_lines.append(numbers)
-            chosen_guess.append(np.interp(numbers, order, samples if order is path else samples[::-1]))
-            chosen_edge.append(np.full(len(numbers), number))
-        if not chosen_lines:
+        path, across = paths[:, :, along], paths[:, :, 1 - along]
+        falling = path[:, -1] < path[:, 0]
+        path = np.where(falling[:, np.newaxis], path[:, ::-1], path)
+        first = np.ceil(np.maximum(path[:, 0], 0)).astype(np.intp)
+        last = np.floor(np.minimum(path[:, -1], lines - 1)).astype(np.intp)
+        seen = (across.max(axis=1) >= -self._reach_px) & (across.min(axis=1) <= length - 1 + self._reach_px)
+        kept = np.flatnonzero(seen & (last >= first))
+        if len(kept) == 0:
             return None
-        line, running, edge = np.concatenate(chosen_lines), np.concatenate(chosen_guess), np.concatenate(chosen_edge)
-        pixels, tangent, reached = self._project(axis, edges[edge], running)
+        counts = last[kept] - first[kept] + 1
+        line = np.arange(counts.sum()) + np.repeat(first[kept] - np.cumsum(counts) + counts, counts)
+        edge = np.repeat(numbers[kept], counts)
+        ends = np.cumsum(counts)
+        running = np.empty(len(line))
+        for number, begin, end in zip(kept, ends - counts, ends, strict=True):
+            at_samples = samples[::-1] if falling[number] else samples
+            running[begin:end] = np.interp(line[begin:end], path[number], at_samples)
+        pixels, tangent, reached = self._project(axis, self._grid.edges[axis][edge], running)
         # The guess is a tenth of a pixel off at most; one Newton step leaves the square of that times the curvature.
         step = (line - pixels[along]) / tangent[along]
-        running = running + step
         at = pixels[1 - along] + tangent[1 - along] * step
         # Far side of an edge: growing "right" (axis 0) or "down" (axis 1) in the panel. With the panel's face to the
         # camera, right x down keeps its sign in the picture, so the tangent's own sign tells on which side it lies.
         sign = 1.0 if (axis == 0) == upright else -1.0
-        slant = sign * tangent[along] / np.hypot(*tangent)
-        cell = np.searchsorted(others, running)
-        areas = self._grid.areas if axis == 0 else self._grid.areas.T
-        near, far = areas[cell, edge], areas[cell, edge + 1]
-        kept = (near != far) & (at > -self._reach_px) & (at < length - 1 + self._reach_px)
-        kept &= reached & (np.abs(slant) > _LEAST_SLANT)
-        if not kept.any():
+        slant = sign * tangent[along] / np.sqrt(tangent[0] * tangent[0] + tangent[1] * tangent[1])
+        sides = self._grid.sides[axis][self._grid.cell_of(1 - axis, running + step), edge]
+        drawn = (sides % 5 != 0) & (at > -self._reach_px) & (at < length - 1 + self._reach_px)
+        drawn &= reached & (np.abs(slant) > _LEAST_SLANT)
+        if not drawn.any():
             return None
-        return _Crossings(*(part[kept] for part in (line, at, slant, near, far)))
+        return _Crossings(*(part[drawn] for part in (line, at, slant, sides)))
 
     def _project(
         self, axis: int, fixed: FloatArray, running: FloatArray
@@ -192,7 +221,7 @@ def _profile_table(colours: tuple[Colour, ...]) -> NDArray[np.uint32]:
 
     ``colours`` of what lies behind, the margin, the first and the second colour (the areas' numbers).
     """
-    half = int(_REACH_SIGMAS * _STEPS_PER_SIGMA)
+    half = int(REACH_SIGMAS * _STEPS_PER_SIGMA)
     share = ndtr(np.arange(-half, half + 1) / _STEPS_PER_SIGMA).astype(np.float32)[:, np.newaxis]
     lights = [light_of_colour(colour) for colour in colours]
     rows = [pack(code(start + (end - start) * share)) for start in lights for end in lights]

@@ -54,3 +54,13 @@ def pack(coded: NDArray[np.uint8]) -> NDArray[np.uint32]:
 def unpack(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
     """The colours (N, 3) uint8 of BGRA words (N,)."""
     return np.ascontiguousarray(words).view(np.uint8).reshape(-1, 4)[:, :3]
+
+
+def blend(under: NDArray[np.uint32], light: LightArray, share: LightArray) -> NDArray[np.uint32]:
+    """BGRA words (N,) of ``share`` (N,) 0..1 of a light (N, 3) over packed pixels (N,)."""
+    packed = np.full(len(under), 0xFF000000, dtype=np.uint32)
+    for channel, shift in enumerate((0, 8, 16)):
+        below = _light_table().take((under >> shift) & 0xFF)
+        coded = code(below + (light[:, channel] - below) * share)
+        packed |= coded.astype(np.uint32) << np.uint32(shift)
+    return packed

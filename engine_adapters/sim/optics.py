@@ -16,14 +16,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_TABLE_NODES = 8192
+_TABLE_NODES = 8193
+_TABLE_STRIDE = 64
 _NEWTON_STEPS = 60
 _BEYOND_PICTURE = 1.02
 
@@ -121,6 +122,33 @@ def undistorted_radius(optics: Optics, distorted: FloatArray) -> FloatArray:
     return np.where(outside, np.nan, radius)
 
 
+def _radial_ratio(optics: Optics, squared: FloatArray) -> FloatArray:
+    """r / r_d at equally spaced r_d^2 from 0: some by the bracketed Newton, those between by one plain step more.
+
+    Where that is not exact (near a fold) all are found by the bracketed one.
+    """
+    ratio = np.ones_like(squared)
+    distorted = np.sqrt(squared[1:])
+    chosen = squared[::_TABLE_STRIDE]
+    coarse = np.ones_like(chosen)
+    coarse[1:] = undistorted_radius(optics, np.sqrt(chosen[1:])) / np.sqrt(chosen[1:])
+    if not np.isfinite(coarse).all():
+        ratio[1:] = undistorted_radius(optics, distorted) / distorted
+        return ratio
+    k1, k2 = optics.k1, optics.k2
+    radius = np.interp(squared[1:], chosen, coarse) * distorted
+    for _ in range(2):
+        q = radius * radius
+        error = radius * (1.0 + q * (k1 + k2 * q)) - distorted
+        radius -= error / (1.0 + q * (3.0 * k1 + 5.0 * k2 * q))
+    q = radius * radius
+    error = radius * (1.0 + q * (k1 + k2 * q)) - distorted
+    if not float(np.abs(error).max()) <= 1e-13 * (1.0 + float(distorted[-1])):
+        radius = undistorted_radius(optics, distorted)
+    ratio[1:] = radius / distorted
+    return ratio
+
+
 class RayTable:
     """Each pixel's exact ray: r / r_d over r_d^2, from the axis to a little beyond the picture's corner."""
 
@@ -128,10 +156,7 @@ class RayTable:
         self._optics = optics
         self._cu, self._cv = optics.center_px
         reach = (optics.corner_radius * _BEYOND_PICTURE) ** 2
-        squared = np.linspace(0.0, reach, _TABLE_NODES)
-        distorted = np.sqrt(squared)
-        ratio = np.ones_like(distorted)
-        ratio[1:] = undistorted_radius(optics, distorted[1:]) / distorted[1:]
+        ratio = _radial_ratio(optics, np.linspace(0.0, reach, _TABLE_NODES))
         self._ratio = ratio
         self._step = np.append(np.diff(ratio), 0.0)
         self._per_unit = (_TABLE_NODES - 1) / reach
@@ -146,6 +171,12 @@ class RayTable:
         np.minimum(node, _TABLE_NODES - 2, out=node)
         ratio = self._ratio[node] + (position - node) * self._step[node]
         return x * ratio, y * ratio
+
+
+@lru_cache(maxsize=4)
+def ray_table(optics: Optics) -> RayTable:
+    """The table of a lens: it is the same in every pose."""
+    return RayTable(optics)
 
 
 @dataclass(frozen=True)

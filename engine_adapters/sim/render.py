@@ -8,6 +8,8 @@ The backdrop is plain polygons: nothing is measured on it.
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -15,14 +17,16 @@ from numpy.typing import NDArray
 from scipy.special import chndtr, ndtr
 
 from calibration.types import Picture
+from engine_adapters.sim.backdrop import FAR_PX, Backdrop
 from engine_adapters.sim.corner_light import CornerLight
-from engine_adapters.sim.edge_light import EdgeLight
-from engine_adapters.sim.light import code, light_of, pack, unpack
-from engine_adapters.sim.optics import RayTable, View
-from engine_adapters.sim.panel_grid import PanelGrid
+from engine_adapters.sim.edge_light import REACH_SIGMAS, EdgeLight
+from engine_adapters.sim.light import Colour, code, light_of
+from engine_adapters.sim.optics import View, ray_table
+from engine_adapters.sim.panel_grid import PanelGrid, grid_of
 from engine_adapters.sim.room import Decoy, Lamp, Panel, Room
 
 FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.intp]
 Words = NDArray[np.uint32]
 
 PIXEL_APERTURE_VARIANCE = 1.0 / 12.0
@@ -30,13 +34,13 @@ PIXEL_APERTURE_VARIANCE = 1.0 / 12.0
 VIRTUAL_BLUR_PX = 0.5
 """Blur of the engine's own render: a sharp, anti-aliased edge."""
 
-_REACH_SIGMAS = 4.0
+_BEND = 1.05
 _STRAIGHT_SIGMAS = 100.0
 _CHUNK = 16_384
-_FIXED_POINT_BITS = 4
-_FAR_PX = 20_000.0
+_BORDER_PX = 8
+"""Kept left and right of the picture: OpenCV's polygons spill over into the outermost columns."""
+_ORIGIN = (_BORDER_PX, 0)
 _NEAR_M = 0.05
-_BLACK = (0, 0, 0)
 _OPAQUE = 255
 
 
@@ -56,21 +60,23 @@ def render_virtual(view: View, room: Room, *, over: Picture | None = None) -> Pi
 
 
 class _Canvas:
-    """A picture being drawn, as BGRA words (single words are gathered and scattered fastest)."""
+    """A picture being drawn, as BGRA words (single words are gathered and scattered fastest).
+
+    Pixel (u, v) is word v * row + u; ``row`` is a little longer than the picture is wide.
+    """
 
     def __init__(self, view: View, blur_px: float, over: Picture | None = None) -> None:
         width, height = view.optics.image_size
         self._view = view
         self._width, self._height = width, height
         self._sigma_px = math.sqrt(blur_px**2 + PIXEL_APERTURE_VARIANCE)
-        self._reach_px = _REACH_SIGMAS * self._sigma_px + 1.0
-        self._pixels: NDArray[np.uint8]
-        if over is None:
-            self._pixels = np.zeros((height, width, 4), dtype=np.uint8)
-        else:
-            self._pixels = np.asarray(cv2.cvtColor(over, cv2.COLOR_BGR2BGRA), dtype=np.uint8)
-        self._words: Words = self._pixels.view(np.uint32)[..., 0]
-        self._table = RayTable(view.optics)
+        self._reach_px = REACH_SIGMAS * self._sigma_px + 1.0
+        self._row = width + 2 * _BORDER_PX
+        self._frame = np.zeros((height, self._row, 4), dtype=np.uint8)
+        self._pixels = self._frame[:, _BORDER_PX : _BORDER_PX + width]
+        if over is not None:
+            self._pixels[...] = cv2.cvtColor(over, cv2.COLOR_BGR2BGRA)
+        self._words: Words = self._frame.view(np.uint32).reshape(-1)[_BORDER_PX:]
 
     def picture(self) -> Picture:
         """What has been drawn, (H, W, 3) uint8 BGR."""
@@ -78,93 +84,109 @@ class _Canvas:
 
     def draw_targets(self, room: Room, *, over_black: bool) -> None:
         """Draw every target that stands wholly in front of the camera."""
-        # One copy serves every panel: none stands before another.
-        behind = None if over_black else self._words.copy()
         for panel in room.panels:
-            self._draw_panel(panel, behind)
+            self._draw_panel(panel, over_black=over_black)
         for lamp in room.lamps:
             self._draw_lamp(lamp)
         if self._view.optics.folds_inside_picture:
             self._black_out_beyond_fold()
 
-    def draw_backdrop(self, backdrop: tuple[Decoy, ...]) -> None:
+    def draw_backdrop(self, decoys: tuple[Decoy, ...]) -> None:
         """Fill the picture with the room's surfaces, far to near."""
-        visible = _clipped(self._view, backdrop)
-        # What lies behind a surface that fills the picture need not be drawn (every backdrop polygon is convex).
-        fills = [number for number, (outline, _) in enumerate(visible) if self._fills_picture(outline)]
-        for outline, decoy in visible[fills[-1] if fills else 0 :]:
-            line = cv2.LINE_AA if decoy.smooth else cv2.LINE_8
-            cv2.fillPoly(self._pixels, [outline], (*decoy.colour, _OPAQUE), line, _FIXED_POINT_BITS)
+        _backdrop_of(decoys).draw(self._view, self._frame, _ORIGIN)
 
-    def _fills_picture(self, outline: NDArray[np.int32]) -> bool:
-        right, bottom = ((side - 1) << _FIXED_POINT_BITS for side in (self._width, self._height))
-        left_most, top_most, wide, high = cv2.boundingRect(outline)
-        if left_most > 0 or top_most > 0 or left_most + wide <= right or top_most + high <= bottom:
-            return False
-        corners = ((0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom))
-        return all(cv2.pointPolygonTest(outline, corner, False) >= 0 for corner in corners)
-
-    def _draw_panel(self, panel: Panel, behind: Words | None) -> None:
-        """Draw over what lies ``behind`` the panels (None: black)."""
-        grid = PanelGrid(panel)
-        if self._view.to_camera(panel.to_world(grid.corners()))[:, 2].min() <= _NEAR_M:
+    def _draw_panel(self, panel: Panel, *, over_black: bool) -> None:
+        grid = grid_of(panel)
+        if self._view.to_camera(grid.corners_m)[:, 2].min() <= _NEAR_M:
             return
-        outline = self._to_pixels(panel, grid.outline())
+        outline = self._to_pixels(grid.outline_m)
         low, high = outline.min(axis=0) - self._reach_px, outline.max(axis=0) + self._reach_px
         if high[0] < 0 or high[1] < 0 or low[0] > self._width - 1 or low[1] > self._height - 1:
             return
-        self._fill_areas(panel, grid, outline)
-        edges = EdgeLight(self._view, panel, grid, self._sigma_px, self._reach_px)
-        edges.draw(self._words, _BLACK if behind is None else behind)
-        u, v = self._pixels_around_corners(panel, grid, outline)
-        corners = CornerLight(self._view, self._table, panel, grid, self._sigma_px)
+        crossings = self._to_pixels(grid.crossings_m).reshape(len(grid.edges[1]), len(grid.edges[0]), 2)
+        apart_px, spread = self._spacing(crossings)
+        edges = None
+        if apart_px >= 2.0 * self._reach_px + 1.0:
+            edges = EdgeLight(self._view, panel, grid, self._sigma_px, self._row)
+            if apart_px < 2.0 * edges.painted_px + 1.0:
+                edges = None
+        if edges is None:
+            u, v = self._pixels_of(outline)
+        else:
+            half = np.floor(_BEND * edges.painted_px * spread + 0.5).astype(int)
+            u, v = self._pixels_around(crossings.reshape(-1, 2), half)
+        where = v * self._row + u
+        under = None if over_black else self._words[where]
+        if edges is not None:
+            beside = None if over_black else edges.behind(self._words)
+            self._fill_areas(panel, grid, outline)
+            edges.draw(self._words, beside)
+        corners = CornerLight(self._view, ray_table(self._view.optics), panel, grid, self._sigma_px)
         for start in range(0, len(u), _CHUNK):
-            part_u, part_v = u[start : start + _CHUNK], v[start : start + _CHUNK]
-            under = np.zeros((len(part_u), 3), dtype=np.uint8) if behind is None else unpack(behind[part_v, part_u])
-            light, seen = corners.at(part_u.astype(np.float64), part_v.astype(np.float64), under)
-            self._words[part_v[seen], part_u[seen]] = pack(code(light))[seen]
+            part = slice(start, start + _CHUNK)
+            drawn, seen = corners.at(
+                u[part].astype(np.float64), v[part].astype(np.float64), None if under is None else under[part]
+            )
+            self._words[where[part][seen]] = drawn[seen]
 
     def _fill_areas(self, panel: Panel, grid: PanelGrid, outline: FloatArray) -> None:
         """The areas away from any edge, as plain polygons."""
         if panel.margin_m > 0.0:
-            cv2.fillPoly(self._pixels, [_whole(outline)], (*panel.margin_colour, _OPAQUE))
-        checker = _whole(self._to_pixels(panel, grid.checker_outline()))
-        cv2.fillPoly(self._pixels, [checker], (*panel.colours[1], _OPAQUE))
+            self._fill([_whole(outline)], panel.margin_colour)
+        checker = _whole(self._to_pixels(grid.checker_outline_m))
+        self._fill([checker], panel.colours[1])
         if panel.colours[0] != panel.colours[1]:
-            cells = grid.first_colour_cells()
-            pixels = _whole(self._to_pixels(panel, cells.reshape(-1, 2))).reshape(cells.shape)
-            cv2.fillPoly(self._pixels, list(pixels), (*panel.colours[0], _OPAQUE))
+            cells = grid.first_colour_cells_m
+            pixels = self._to_pixels(cells.reshape(-1, 3)).reshape(*cells.shape[:2], 2)
+            seen = (pixels.max(axis=1) >= 0.0) & (pixels.min(axis=1) <= (self._width, self._height))
+            self._fill(list(_whole(pixels[seen.all(axis=1)])), panel.colours[0])
 
-    def _to_pixels(self, panel: Panel, plane_m: FloatArray) -> FloatArray:
-        return self._view.to_pixels(self._view.to_camera(panel.to_world(plane_m)))
+    def _fill(self, outlines: Sequence[NDArray[np.int32]], colour: Colour) -> None:
+        cv2.fillPoly(self._frame, outlines, (*colour, _OPAQUE), offset=_ORIGIN)
 
-    def _pixels_around_corners(
-        self, panel: Panel, grid: PanelGrid, outline: FloatArray
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Pixels (u, v) that more than one edge reaches: around each crossing, or all where cells are small."""
-        reach = self._reach_px
-        crossings = self._to_pixels(panel, grid.crossings())
-        lattice = crossings.reshape(len(grid.edges[1]), len(grid.edges[0]), 2)
-        steps = np.abs(np.concatenate([np.diff(lattice, axis=axis).reshape(-1, 2) for axis in (0, 1)]))
-        slope = float(np.max(steps.min(axis=1) / np.maximum(steps.max(axis=1), 1e-9)))
-        half = math.ceil(reach * (1.0 + slope))
-        mask = np.zeros((self._height, self._width), dtype=np.uint8)
-        if float(np.hypot(steps[:, 0], steps[:, 1]).min()) < 2 * reach:
-            whole = _whole(outline)
-            cv2.fillPoly(mask, [whole], 255)
-            cv2.polylines(mask, [whole], True, 255, 2 * math.ceil(reach) + 1)
-        else:
-            inside = (crossings > -half).all(axis=1)
-            inside &= (crossings < (self._width + half, self._height + half)).all(axis=1)
-            for u, v in _whole(crossings[inside]):
-                mask[max(0, v - half) : v + half + 1, max(0, u - half) : u + half + 1] = 255
-        low = np.maximum(outline.min(axis=0) - half - 1, 0).astype(int)
-        high = np.maximum(outline.max(axis=0) + half + 2, 0).astype(int)
-        found = cv2.findNonZero(np.ascontiguousarray(mask[low[1] : high[1], low[0] : high[0]]))
-        if found is None:
-            return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
-        found = found.reshape(-1, 2)
-        return found[:, 0].astype(np.intp) + low[0], found[:, 1].astype(np.intp) + low[1]
+    def _to_pixels(self, world_m: FloatArray) -> FloatArray:
+        return self._view.to_pixels(self._view.to_camera(world_m))
+
+    def _spacing(self, crossings: FloatArray) -> tuple[float, FloatArray]:
+        """Of the cells in the picture, from their corners (rows, columns, 2): the least distance of two edges in px,
+        and how far (in u and v) the pixels reach that are nearer than 1 px to two edges that cross."""
+        down, across = np.diff(crossings, axis=0)[:, :-1], np.diff(crossings, axis=1)[:-1]
+        corners = np.stack([crossings[:-1, :-1], crossings[1:, :-1], crossings[:-1, 1:], crossings[1:, 1:]])
+        seen = (corners.max(axis=0) >= -self._reach_px) & (
+            corners.min(axis=0) <= (self._width + self._reach_px, self._height + self._reach_px)
+        )
+        chosen = seen.all(axis=2)
+        if not chosen.any():
+            return math.inf, np.ones(2)
+        down, across = down[chosen], across[chosen]
+        long_down, long_across = np.hypot(*down.T), np.hypot(*across.T)
+        area = np.maximum(np.abs(down[:, 0] * across[:, 1] - down[:, 1] * across[:, 0]), 1e-9)
+        apart = float((area / np.maximum(np.maximum(long_down, long_across), 1e-9)).min())
+        # A point s e + t g (unit vectors at the angle a) is nearer than 1 to both lines while |s|, |t| < 1 / sin a.
+        reach = (np.abs(down) * long_across[:, np.newaxis] + np.abs(across) * long_down[:, np.newaxis]) / area[:, np.newaxis]
+        return apart, np.asarray(reach.max(axis=0), dtype=np.float64)
+
+    def _pixels_around(self, crossings: FloatArray, half: NDArray[np.int_]) -> tuple[IndexArray, IndexArray]:
+        """Pixels (u, v) of the boxes around crossings: those that more than one edge reaches."""
+        limit = np.array([self._width, self._height])
+        centres = np.rint(crossings[((crossings > -half - 1) & (crossings < limit + half)).all(axis=1)]).astype(np.intp)
+        across, down = (np.arange(-reach, reach + 1) for reach in half)
+        u = (centres[:, 0, np.newaxis] + np.tile(across, len(down))).ravel()
+        v = (centres[:, 1, np.newaxis] + np.repeat(down, len(across))).ravel()
+        inside = (u >= 0) & (u < self._width) & (v >= 0) & (v < self._height)
+        return (u, v) if inside.all() else (u[inside], v[inside])
+
+    def _pixels_of(self, outline: FloatArray) -> tuple[IndexArray, IndexArray]:
+        """Pixels (u, v) of the whole panel and a little around it."""
+        thick = math.ceil(self._reach_px)
+        low = np.clip(np.floor(outline.min(axis=0)).astype(int) - thick - 1, 0, None)
+        high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + thick + 2, (self._width, self._height))
+        mask = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.uint8)
+        whole = _whole(outline - low)
+        cv2.fillPoly(mask, [whole], 255)
+        cv2.polylines(mask, [whole], True, 255, 2 * thick + 1)
+        v, u = np.nonzero(mask)
+        return u + low[0], v + low[1]
 
     def _draw_lamp(self, lamp: Lamp) -> None:
         """A bright disk: its mean under a Gaussian is the non-central chi-square distribution, a large disk's Phi."""
@@ -173,7 +195,7 @@ class _Canvas:
         camera = self._view.to_camera(points)
         if camera[:, 2].min() <= _NEAR_M:
             return
-        pixels = np.clip(self._view.to_pixels(camera), -_FAR_PX, _FAR_PX)
+        pixels = np.clip(self._view.to_pixels(camera), -FAR_PX, FAR_PX)
         radius_px = math.sqrt(abs(float(np.linalg.det(pixels[1:] - pixels[0]))))
         reach = math.ceil(radius_px + self._reach_px) + 1
         (low_u, low_v), (high_u, high_v) = (
@@ -203,57 +225,23 @@ class _Canvas:
         cu, cv = optics.center_px
         x2 = ((np.arange(self._width) - cu) / optics.f_px) ** 2
         y2 = ((np.arange(self._height) - cv) / (optics.f_px * optics.pixel_aspect)) ** 2
-        self._words[x2[np.newaxis, :] + y2[:, np.newaxis] > limit * limit] = 0
+        self._pixels[x2[np.newaxis, :] + y2[:, np.newaxis] > limit * limit] = 0
 
 
 def _whole(pixels: FloatArray) -> NDArray[np.int32]:
-    return np.asarray(np.rint(np.clip(pixels, -_FAR_PX, _FAR_PX)), dtype=np.int32)
+    return np.asarray(np.rint(np.clip(pixels, -FAR_PX, FAR_PX)), dtype=np.int32)
 
 
-def _fixed_point(outline: FloatArray) -> NDArray[np.int32]:
-    scaled = np.clip(outline, -_FAR_PX, _FAR_PX) * (1 << _FIXED_POINT_BITS)
-    return np.asarray(np.rint(scaled), dtype=np.int32)
+class _LastBackdrop(threading.local):
+    """A thread draws the same room again and again."""
+
+    backdrop = Backdrop(())
 
 
-def _clipped(view: View, backdrop: tuple[Decoy, ...]) -> list[tuple[NDArray[np.int32], Decoy]]:
-    """The outlines in fixed-point pixels, cut outside the picture (so that nothing behind the camera is projected)."""
-    if not backdrop:
-        return []
-    points = view.to_camera(np.concatenate([decoy.outline_m for decoy in backdrop]))
-    # A point is kept while both |x| and |y| stay under ``wide`` times its depth: four planes through the pupil.
-    wide = 2.0 * view.picture_radius
-    planes = np.array([(1.0, 0.0, wide), (-1.0, 0.0, wide), (0.0, 1.0, wide), (0.0, -1.0, wide)])
-    inside = points @ planes.T
-    ends = np.cumsum([len(decoy.outline_m) for decoy in backdrop])
-    begins = np.concatenate([[0], ends[:-1]])
-    lowest, highest = (pick.reduceat(inside, begins, axis=0) for pick in (np.minimum, np.maximum))
-    kept = []
-    for number in np.flatnonzero((highest > 0.0).all(axis=1)):
-        outline = points[begins[number] : ends[number]]
-        for plane in planes[lowest[number] < 0.0]:
-            outline = _cut(outline, plane)
-        if len(outline) >= 3:
-            kept.append((outline, backdrop[number]))
-    if not kept:
-        return []
-    pixels = _fixed_point(view.to_pixels(np.concatenate([outline for outline, _ in kept])))
-    starts = np.cumsum([0, *(len(outline) for outline, _ in kept)])
-    return [(pixels[starts[i] : starts[i + 1]], decoy) for i, (_, decoy) in enumerate(kept)]
+_last = _LastBackdrop()
 
 
-def _cut(outline: FloatArray, plane: FloatArray) -> FloatArray:
-    """The part of a polygon (N, 3) on the positive side of a plane through the origin.
-
-    I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", 1974.
-    """
-    if len(outline) == 0:
-        return outline
-    heights = outline @ plane
-    kept = heights > 0.0
-    following = np.concatenate((outline[1:], outline[:1]))
-    next_heights = np.concatenate((heights[1:], heights[:1]))
-    crossing = kept != (next_heights > 0.0)
-    share = heights / np.where(crossing, heights - next_heights, 1.0)
-    cuts = outline + share[:, np.newaxis] * (following - outline)
-    both = np.stack([outline, cuts], axis=1).reshape(-1, 3)
-    return np.asarray(both[np.column_stack([kept, crossing]).ravel()], dtype=np.float64)
+def _backdrop_of(decoys: tuple[Decoy, ...]) -> Backdrop:
+    if _last.backdrop.decoys is not decoys:
+        _last.backdrop = Backdrop(decoys)
+    return _last.backdrop

@@ -250,7 +250,7 @@ def test_a_pupil_off_the_pivot_is_measured_where_the_pictures_contradict_the_giv
 
 
 def test_one_wrong_pose_among_few_pictures_is_found_out() -> None:
-    """Four pictures, one pan angle 0.3 degrees off and said to be exact: the lens bends to suit it, and no point is out."""
+    """Four pictures, one pan angle 0.3 degrees off but said to be exact: the lens bends to suit it."""
     views = [v for v, angle in zip(posed_views(WIDE, np.random.default_rng(16)), ANGLES, strict=True) if angle[0]][:4]
     assert views[1].camera_pose is not None
     wrong = replace(views[1].camera_pose, pan_deg=views[1].camera_pose.pan_deg + 0.3)
