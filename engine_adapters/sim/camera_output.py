@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import time
+from dataclasses import dataclass
 from enum import StrEnum
 
 import cv2
@@ -47,20 +48,23 @@ class CameraOutput:
         self._size = image_size
         self._rng = np.random.default_rng(seed)
         self._statistics = statistics
-        self._real: tuple[tuple[View, float], Picture] | None = None
-        self._virtual: tuple[View, Picture] | None = None
+        self._real = _Drawn()
+        self._virtual = _Drawn()
         width, height = image_size
         self._black: Picture = np.zeros((height, width, 3), dtype=np.uint8)
         self._bank = self._rng.standard_normal(width * height * 3 + _SPARE_NOISE, dtype=np.float32)
         self._noise: tuple[float, NDArray[np.uint8], NDArray[np.uint8]] | None = None
 
     def prepare(self, state: OutputState) -> None:
-        """Draw the state's noiseless pictures ahead of the request for them."""
+        """Draw the state's noiseless picture ahead of the request for it.
+
+        It is kept until the next one is prepared: pictures asked for on the way there do not displace it.
+        """
         if state.real is not None:
-            self._real_picture(*state.real[:2])
+            self._real.ahead = state.real[:2], self._real_picture(*state.real[:2])
             self._noise_parts(state.real[2])
         elif state.virtual is not None:
-            self._virtual_picture(state.virtual)
+            self._virtual.ahead = state.virtual, self._virtual_picture(state.virtual)
 
     def picture(self, state: OutputState) -> Picture:
         """The picture of a state, (H, W, 3) uint8 BGR; not to be written to."""
@@ -80,16 +84,20 @@ class CameraOutput:
         return coded
 
     def _real_picture(self, view: View, blur_px: float) -> Picture:
-        if self._real is None or self._real[0] != (view, blur_px):
+        picture = self._real.find((view, blur_px))
+        if picture is None:
             with _Timed(self._statistics):
-                self._real = (view, blur_px), render_real(view, self._room, blur_px)
-        return self._real[1]
+                picture = render_real(view, self._room, blur_px)
+            self._real.latest = (view, blur_px), picture
+        return picture
 
     def _virtual_picture(self, view: View) -> Picture:
-        if self._virtual is None or self._virtual[0] != view:
+        picture = self._virtual.find(view)
+        if picture is None:
             with _Timed(self._statistics):
-                self._virtual = view, render_virtual(view, self._room)
-        return self._virtual[1]
+                picture = render_virtual(view, self._room)
+            self._virtual.latest = view, picture
+        return picture
 
     def _noisy(self, picture: Picture, sigma: float) -> Picture:
         if sigma == 0.0:
@@ -108,6 +116,20 @@ class CameraOutput:
             below = np.clip(-rounded, 0, 255).astype(np.uint8)
             self._noise = sigma, above, below
         return self._noise[1], self._noise[2]
+
+
+@dataclass(slots=True)
+class _Drawn:
+    """Noiseless pictures at hand, each with what it was drawn for: the latest, and the one drawn ahead."""
+
+    latest: tuple[object, Picture] | None = None
+    ahead: tuple[object, Picture] | None = None
+
+    def find(self, wanted: object) -> Picture | None:
+        for kept in (self.latest, self.ahead):
+            if kept is not None and kept[0] == wanted:
+                return kept[1]
+        return None
 
 
 class _Timed:

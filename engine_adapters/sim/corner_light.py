@@ -97,8 +97,8 @@ class CornerLight:
         ]
         nearest_m = min(float(np.diff(edges).min()) for edges in grid.edges)
         sigma_m = sigma_px * float(np.linalg.norm(centre)) / self._optics.f_px
-        # An edge farther than 4.5 sigma from a pixel adds less than 1e-5; half a cell lies between it and the nearest.
-        neighbours = math.ceil(max(0.0, 4.5 * sigma_m / nearest_m - 0.5))
+        # An edge farther than 4 sigma from a pixel adds less than 3e-5; half a cell lies between it and the nearest.
+        neighbours = math.ceil(max(0.0, 4.0 * sigma_m / nearest_m - 0.5))
         self._steps = [_steps(panel, axis, neighbours) for axis in (0, 1)]
         first, second = (light_of_colour(colour) for colour in panel.colours)
         margin = light_of_colour(panel.margin_colour) if panel.margin_m > 0.0 else np.zeros(3, dtype=np.float32)

@@ -64,14 +64,30 @@ class _Strokes:
     sides: IndexArray
     border: tuple[IndexArray, IndexArray] | None
 
-    def pixels(self) -> Iterator[tuple[IndexArray, NDArray[np.float32], IndexArray]]:
-        """Flat pixel numbers, their distances in sigmas, and what lies on their edge's sides, one k after another."""
+    @property
+    def offsets(self) -> NDArray[np.float32]:
+        """All k."""
+        return np.arange(-self.reach, self.reach + 1, dtype=np.float32)
+
+    def places(self) -> tuple[IndexArray, NDArray[np.bool_]]:
+        """The words of all k and crossings that lie in the picture (N,), and which those are (k, crossings)."""
+        k = np.arange(-self.reach, self.reach + 1)[:, np.newaxis]
+        if self.border is None:
+            inside = np.ones((len(k), len(self.base)), dtype=np.bool_)
+        else:
+            inside = (self.border[0] + k >= 0) & (self.border[1] - k >= 0)
+        return (self.base + k * self.stride)[inside], inside
+
+    def pixels(self, words: Words) -> Iterator[tuple[int, Words, IndexArray, NDArray[np.bool_] | None]]:
+        """For each k: the words and the places in them, and which of the crossings they belong to (None: all)."""
+        first = self.base - self.reach * self.stride
         for k in range(-self.reach, self.reach + 1):
-            where, distance, sides = self.base + k * self.stride, self.start + np.float32(k) * self.scale, self.sides
-            if self.border is not None:
+            if self.border is None:
+                # The same places in words that begin later: one addition for all pixels less.
+                yield k, words[(k + self.reach) * self.stride :], first, None
+            else:
                 inside = (self.border[0] + k >= 0) & (self.border[1] - k >= 0)
-                where, distance, sides = where[inside], distance[inside], sides[inside]
-            yield where, distance, sides
+                yield k, words, self.base[inside] + k * self.stride, inside
 
 
 class EdgeLight:
@@ -99,32 +115,41 @@ class EdgeLight:
 
     def draw(self, words: Words, behind: list[Words] | None) -> None:
         """Draw the edges into packed pixels over what :meth:`behind` found, or over black."""
-        table = _profile_table((_BLACK, self._panel.margin_colour, *self._panel.colours))
-        half, row = table.shape[1] // 2, table.shape[1]
-        flat_table = table.reshape(-1)
+        colours = (_BLACK, self._panel.margin_colour, *self._panel.colours)
+        table = _profile_table(colours)
+        row = table.shape[1]
+        entries = table.reshape(-1)
         for strokes in self._plain if behind is not None else [*self._plain, *self._open]:
-            for where, distance, sides in strokes.pixels():
-                index = distance * np.float32(_STEPS_PER_SIGMA) + np.float32(half + 0.5)
-                index = np.minimum(np.maximum(index, np.float32(0), out=index), np.float32(row - 1), out=index)
-                words[where] = flat_table.take(index.astype(np.intp) + sides * row)
+            start = strokes.start * np.float32(_STEPS_PER_SIGMA) + np.float32(row // 2 + 0.5)
+            scale = strokes.scale * np.float32(_STEPS_PER_SIGMA)
+            begins = (strokes.sides * row).astype(np.float32)
+            for k, part, where, among in strokes.pixels(words):
+                index = start + np.float32(k) * scale
+                np.clip(index, 0, row - 1, out=index)
+                index += begins
+                chosen = index.astype(np.intp) if among is None else index[among].astype(np.intp)
+                part[where] = entries.take(chosen, mode="clip")
         if behind is None:
             return
-        lights = np.stack([light_of_colour(colour) for colour in (_BLACK, self._panel.margin_colour, *self._panel.colours)])
-        unders = iter(behind)
-        for strokes in self._open:
-            for where, distance, sides in strokes.pixels():
-                near, far = sides >> 2, sides & 3
-                share = ndtr(np.where(near == BEHIND, distance, -distance))
-                words[where] = blend(next(unders), lights[near + far], share)
+        lights = np.stack([light_of_colour(colour) for colour in colours])
+        for strokes, under in zip(self._open, behind, strict=True):
+            # One of the two sides is what lies behind, area 0.
+            near, far = strokes.sides >> 2, strokes.sides & 3
+            toward = np.where(near == BEHIND, np.float32(1), np.float32(-1))
+            where, reached = strokes.places()
+            distance = np.multiply.outer(strokes.offsets, strokes.scale * toward) + strokes.start * toward
+            shown = np.broadcast_to(near + far, distance.shape)[reached]
+            words[where] = blend(under, lights[shown], ndtr(distance[reached]))
 
     def behind(self, words: Words) -> list[Words]:
         """What now stands in the picture where the panel's outermost edges will be drawn."""
-        return [words[where] for strokes in self._open for where, _, _ in strokes.pixels()]
+        return [words[strokes.places()[0]] for strokes in self._open]
 
     def _strokes(self, found: _Crossings, chosen: NDArray[np.bool_], upright: bool) -> _Strokes:
         width, height = self._view.optics.image_size
         length, line_stride, stride = (width, self._row, 1) if upright else (height, 1, self._row)
-        line, at, slant, sides = (part[chosen] for part in (found.line, found.at, found.slant, found.sides))
+        line, sides = found.line[chosen], found.sides[chosen]
+        at, slant = found.at[chosen], found.slant[chosen]
         reach = math.floor(REACH_SIGMAS * self._sigma_px / float(np.abs(slant).min()) + 0.5)
         self.painted_px = max(self.painted_px, (reach + 0.5) * float(np.abs(slant).max()))
         nearest = np.rint(at).astype(np.intp)

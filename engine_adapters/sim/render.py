@@ -54,7 +54,8 @@ def render_real(view: View, room: Room, blur_px: float) -> Picture:
 
 def render_virtual(view: View, room: Room, *, over: Picture | None = None) -> Picture:
     """The engine's own render of the targets on black, or ``over`` the camera's picture, (H, W, 3) uint8 BGR."""
-    canvas = _Canvas(view, VIRTUAL_BLUR_PX, over)
+    canvas = _Canvas(view, VIRTUAL_BLUR_PX)
+    canvas.begin_over(over)
     canvas.draw_targets(room, over_black=over is None)
     return canvas.picture()
 
@@ -65,22 +66,27 @@ class _Canvas:
     Pixel (u, v) is word v * row + u; ``row`` is a little longer than the picture is wide.
     """
 
-    def __init__(self, view: View, blur_px: float, over: Picture | None = None) -> None:
+    def __init__(self, view: View, blur_px: float) -> None:
         width, height = view.optics.image_size
         self._view = view
         self._width, self._height = width, height
         self._sigma_px = math.sqrt(blur_px**2 + PIXEL_APERTURE_VARIANCE)
         self._reach_px = REACH_SIGMAS * self._sigma_px + 1.0
         self._row = width + 2 * _BORDER_PX
-        self._frame = np.zeros((height, self._row, 4), dtype=np.uint8)
+        self._frame = _kept.frame(height, self._row)
         self._pixels = self._frame[:, _BORDER_PX : _BORDER_PX + width]
-        if over is not None:
-            self._pixels[...] = cv2.cvtColor(over, cv2.COLOR_BGR2BGRA)
         self._words: Words = self._frame.view(np.uint32).reshape(-1)[_BORDER_PX:]
 
     def picture(self) -> Picture:
         """What has been drawn, (H, W, 3) uint8 BGR."""
         return np.asarray(cv2.cvtColor(self._pixels, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
+
+    def begin_over(self, over: Picture | None) -> None:
+        """Begin with a picture (H, W, 3) uint8 BGR, or with black."""
+        if over is None:
+            self._frame.fill(0)
+        else:
+            self._pixels[...] = cv2.cvtColor(over, cv2.COLOR_BGR2BGRA)
 
     def draw_targets(self, room: Room, *, over_black: bool) -> None:
         """Draw every target that stands wholly in front of the camera."""
@@ -92,8 +98,8 @@ class _Canvas:
             self._black_out_beyond_fold()
 
     def draw_backdrop(self, decoys: tuple[Decoy, ...]) -> None:
-        """Fill the picture with the room's surfaces, far to near."""
-        _backdrop_of(decoys).draw(self._view, self._frame, _ORIGIN)
+        """Begin with the room's surfaces, far to near."""
+        _kept.backdrop_of(decoys).draw(self._view, self._frame, _ORIGIN)
 
     def _draw_panel(self, panel: Panel, *, over_black: bool) -> None:
         grid = grid_of(panel)
@@ -163,7 +169,9 @@ class _Canvas:
         area = np.maximum(np.abs(down[:, 0] * across[:, 1] - down[:, 1] * across[:, 0]), 1e-9)
         apart = float((area / np.maximum(np.maximum(long_down, long_across), 1e-9)).min())
         # A point s e + t g (unit vectors at the angle a) is nearer than 1 to both lines while |s|, |t| < 1 / sin a.
-        reach = (np.abs(down) * long_across[:, np.newaxis] + np.abs(across) * long_down[:, np.newaxis]) / area[:, np.newaxis]
+        reach = (np.abs(down) * long_across[:, np.newaxis] + np.abs(across) * long_down[:, np.newaxis]) / area[
+            :, np.newaxis
+        ]
         return apart, np.asarray(reach.max(axis=0), dtype=np.float64)
 
     def _pixels_around(self, crossings: FloatArray, half: NDArray[np.int_]) -> tuple[IndexArray, IndexArray]:
@@ -232,16 +240,23 @@ def _whole(pixels: FloatArray) -> NDArray[np.int32]:
     return np.asarray(np.rint(np.clip(pixels, -FAR_PX, FAR_PX)), dtype=np.int32)
 
 
-class _LastBackdrop(threading.local):
-    """A thread draws the same room again and again."""
+class _Kept(threading.local):
+    """What a thread keeps from one picture to the next: most often it draws the same room in the same size again."""
 
-    backdrop = Backdrop(())
+    _backdrop = Backdrop(())
+    _frame: NDArray[np.uint8] = np.zeros((0, 0, 4), dtype=np.uint8)
+
+    def backdrop_of(self, decoys: tuple[Decoy, ...]) -> Backdrop:
+        if self._backdrop.decoys is not decoys:
+            self._backdrop = Backdrop(decoys)
+        return self._backdrop
+
+    def frame(self, height: int, row: int) -> NDArray[np.uint8]:
+        """Pixels (height, row, 4) with anything in them."""
+        # Memory fresh from the system costs as much as all that is drawn into it.
+        if self._frame.shape[:2] != (height, row):
+            self._frame = np.empty((height, row, 4), dtype=np.uint8)
+        return self._frame
 
 
-_last = _LastBackdrop()
-
-
-def _backdrop_of(decoys: tuple[Decoy, ...]) -> Backdrop:
-    if _last.backdrop.decoys is not decoys:
-        _last.backdrop = Backdrop(decoys)
-    return _last.backdrop
+_kept = _Kept()

@@ -70,6 +70,7 @@ def _look_at(panel: Panel, ray: FloatArray, pupil_m: FloatArray, light: FloatArr
         (TELE, -5.1, 1.03, 0.0, RoomKind.BOARDS),
         (TELE, 4.0, 0.3, -33.0, RoomKind.BOARDS),
         (replace(WIDE, k1=0.4, k2=0.2), 20.0, 8.0, 0.0, RoomKind.BOARDS),
+        (replace(WIDE, f_px=600.0, k1=-0.08, k2=0.01), 4.0, -2.0, 5.0, RoomKind.BOARDS),  # squares of 1 to 12 px
     ],
 )
 def test_edges_and_corners_equal_brute_force(
@@ -190,3 +191,32 @@ def test_pixels_that_no_ray_reaches_are_black() -> None:
     picture = render_real(View(folded, PIVOT_M), build_room(), 0.6)
     assert not picture[0, 0].any()
     assert picture[540, 960].any()
+
+
+def test_a_picture_does_not_depend_on_the_one_before() -> None:
+    room = build_room()
+    for optics in (WIDE, TELE):
+        view = View(optics, PIVOT_M, -2.0, 0.5)
+        first = render_real(view, room, 0.6)
+        white = np.full_like(first, 255)
+        render_virtual(View(WIDE, PIVOT_M, 20.0, 5.0, 30.0), room, over=white)
+        assert np.array_equal(render_real(view, room, 0.6), first)
+        render_virtual(view, room, over=white)
+        assert render_virtual(view, room).min() == 0
+
+
+def test_a_target_beside_the_picture_leaves_no_trace_in_its_outermost_columns() -> None:
+    square = Panel("square", (1, 1), (0.6, 0.6), ((34, 28, 196), (34, 28, 196)), (0.0, 5.0, 1.6))
+    room = Room(RoomKind.SQUARE, (square,), (), ())
+    optics = Optics((1920, 1080), 5000.0)
+    sigma_px = float(np.sqrt(VIRTUAL_BLUR_PX**2 + PIXEL_APERTURE_VARIANCE))
+    # Turns at which OpenCV's polygons fill pixels that they should not.
+    for turn in ((12.86, 2.66, -44.8), (-12.99, -2.5, -17.7)):
+        view = View(optics, PIVOT_M, *turn)
+        picture = render_virtual(view, room)
+        for column, inward in ((0, 1), (1919, 1918)):
+            step = np.abs(picture[:, column].astype(int) - picture[:, inward]).max(axis=1)
+            rows = np.argsort(step)[-12:]
+            pixels = np.column_stack([np.full(len(rows), column), rows])
+            expected = code(brute_force(view, room, sigma_px, pixels).astype(np.float32)).astype(int)
+            assert np.abs(picture[rows, column].astype(int) - expected).max() <= 3
