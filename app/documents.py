@@ -1,29 +1,47 @@
 """The documents that people write: picture sets and jobs, checked field by field.
 
 A mistake becomes one line: which field, what is wrong with it, what to write instead. Names, units and meanings
-are those of ``docs/reference``. Fields that are not known are refused in a job (a misspelt option must not be
-ignored) and kept out of the way in a picture set (other tools add their own).
+are those of ``docs/reference``. Fields that are not known are refused in a job; in a picture set only those that look
+like a misspelt one are (other tools add their own).
 """
 
 from __future__ import annotations
 
+import difflib
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from calibration.camera import target_rotation
 from calibration.errors import CalibrationError
 from calibration.types import CameraPose, Role, Target, TargetKind, TargetPose
 
+_NEAREST_M = 0.01
+_EDGE_ON = 0.05
+# Cosine of 87 degrees: seen flatter than that, no pattern can be read.
+
 MAX_DOCUMENT_BYTES = 16 * 1024 * 1024
 """Largest JSON document read: a set of 100,000 pictures stays below it."""
+
+_LIKELY_MISSPELT = 0.8
+# Likeness (difflib) above which an unknown field is taken for a misspelt one; others are somebody else's.
+
+
+def _printable(name: str) -> str:
+    if not name.strip() or not name.isprintable():
+        raise ValueError("must be printable characters, not only blanks")
+    return name
+
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Side = Annotated[int, Field(ge=16, le=32768)]
-Name = Annotated[str, Field(min_length=1, max_length=200)]
+Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
+FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 Unit = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -32,7 +50,20 @@ class DocumentError(Exception):
 
 
 class _Loose(BaseModel):
+    """Unknown fields are somebody else's and left alone, unless they look like a misspelt one of ours."""
+
     model_config = ConfigDict(extra="ignore", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_misspelt_fields(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            for name in data:
+                known = cls.model_fields
+                like = difflib.get_close_matches(str(name), known, n=1, cutoff=_LIKELY_MISSPELT)
+                if name not in known and like:
+                    raise ValueError(f"field {name!r} is not known; is {like[0]!r} meant?")
+        return data
 
 
 class _Strict(BaseModel):
@@ -96,9 +127,9 @@ class CameraPoseModel(_Loose):
 class PictureModel(_Loose):
     """One picture of a set, and what is known of it."""
 
-    file: Name
-    zoom: Finite = 0.0
-    focus: Finite = 0.0
+    file: FileName
+    zoom: Unit = 0.0
+    focus: Unit = 0.0
     target: Name
     role: Role = Role.FREE
     camera_pose: CameraPoseModel | None = None
@@ -114,7 +145,7 @@ class PictureSet(_Loose):
     sensor_mm: tuple[Positive, Positive] | None = None
     pixel_aspect: Positive = 1.0
     transfer: Literal["bt709", "srgb", "linear"] | None = None
-    targets: dict[str, TargetModel] = Field(min_length=1)
+    targets: dict[Name, TargetModel] = Field(min_length=1)
     pictures: list[PictureModel] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -123,6 +154,13 @@ class PictureSet(_Loose):
             if picture.target not in self.targets:
                 known = ", ".join(sorted(self.targets))
                 raise ValueError(f"pictures[{index}].target {picture.target!r} is not in targets ({known})")
+        seen: set[tuple[str, str]] = set()
+        for index, picture in enumerate(self.pictures):
+            if (picture.file, picture.target) in seen:
+                raise ValueError(
+                    f"pictures[{index}] lists {picture.file!r} with target {picture.target!r} a second time; remove it"
+                )
+            seen.add((picture.file, picture.target))
         return self
 
 
@@ -131,6 +169,20 @@ class LevelModel(_Strict):
 
     zoom: Unit
     focus: Unit
+
+
+def _check_faces(name: str, pose: TargetPoseModel, pivot_m: tuple[float, float, float]) -> None:
+    """Refuse a target that the camera, wherever it is turned, sees from behind or edge-on, or that it stands in."""
+    to_camera = np.asarray(pivot_m) - np.asarray(pose.centre_m)
+    distance_m = float(np.linalg.norm(to_camera))
+    into_board = target_rotation(pose.yaw_deg, pose.pitch_deg, pose.roll_deg)[:, 2]
+    if distance_m < _NEAREST_M:
+        raise ValueError(f"targets.{name}.pose.centre_m {pose.centre_m} is where the camera stands ({pivot_m})")
+    if float(-into_board @ to_camera) < _EDGE_ON * distance_m:
+        raise ValueError(
+            f"targets.{name} turns its back to the camera: it is behind it, or its yaw is wrong (at yaw 0 a target "
+            "faces -Y, towards a camera at smaller Y)"
+        )
 
 
 class JobRequest(_Strict):
@@ -145,7 +197,7 @@ class JobRequest(_Strict):
     sensor_mm: tuple[Positive, Positive] | None = None
     pixel_aspect: Positive = 1.0
     levels: list[LevelModel] = Field(min_length=1, max_length=1000)
-    targets: dict[str, TargetModel] = Field(min_length=1, description="surveyed targets: each needs its pose")
+    targets: dict[Name, TargetModel] = Field(min_length=1, description="surveyed targets: each needs its pose")
     pivot_m: tuple[Finite, Finite, Finite] = Field(description="where the camera's pivot stands")
     pivot_sigma_m: NotNegative = 0.0
     angle_sigma_deg: NotNegative = Field(default=0.0, description="the head's encoders, one sigma")
@@ -159,6 +211,7 @@ class JobRequest(_Strict):
         for name, target in self.targets.items():
             if target.pose is None:
                 raise ValueError(f"targets.{name}.pose is missing: an engine's target needs its surveyed place")
+            _check_faces(name, target.pose, self.pivot_m)
         seen: set[tuple[float, float]] = set()
         for index, level in enumerate(self.levels):
             if (level.zoom, level.focus) in seen:
@@ -176,7 +229,7 @@ def one_line(error: ValidationError) -> str:
     """The first thing wrong with a document, as ``field: what``, and how many more there are."""
     problems = error.errors(include_url=False)
     first = problems[0]
-    field = ".".join(str(part) for part in first["loc"])
+    field = ".".join(str(part) if str(part).isprintable() else repr(part) for part in first["loc"])
     message = str(first["msg"]).removeprefix("Value error, ")
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{field}: {message}{more}" if field else f"{message}{more}"

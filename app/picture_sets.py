@@ -11,7 +11,7 @@ from datetime import datetime
 from app.documents import PictureModel, PictureSet
 from app.jobs.cpu import Cpu
 from calibration.detect.target import find_target
-from calibration.errors import CalibrationError, InvalidInput
+from calibration.errors import CalibrationError, InvalidInput, NotEnoughData
 from calibration.image import Transfer, decode_picture
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, solve_level
@@ -118,7 +118,8 @@ def _solve(
         held_out = held_out_residuals(fit, views)
         result = level_result(fit, zoom, focus, held_out=held_out, left_out=left_out)
     except CalibrationError as error:
-        shift_only = shift_only_result(views, described.image_size, zoom, focus, left_out)
+        too_little = isinstance(error, NotEnoughData)
+        shift_only = shift_only_result(views, described.image_size, zoom, focus, left_out) if too_little else None
         if shift_only is not None:
             shift_only = replace(shift_only, frames=Frames(real=len(pictures)))
             return SetLevel(shift_only, None, tuple(views))

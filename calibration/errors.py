@@ -38,15 +38,16 @@ class GeometryError(CalibrationError):
 class FoldedLens(CalibrationError):
     """The polynomial folds inside the picture, so that two rays land on one pixel.
 
-    Attributes: ``valid_radius`` (focal-length units), ``needed_radius`` (the picture's farthest corner).
+    Attributes, distances from the optical axis on the picture in focal lengths: ``fold_radius`` where it folds,
+    ``corner_radius`` of the picture's farthest corner.
     """
 
-    def __init__(self, valid_radius: float, needed_radius: float) -> None:
-        self.valid_radius = valid_radius
-        self.needed_radius = needed_radius
+    def __init__(self, fold_radius: float, corner_radius: float) -> None:
+        self.fold_radius = fold_radius
+        self.corner_radius = corner_radius
         super().__init__(
-            f"the lens folds inside the picture: rays beyond radius {valid_radius:.4f} fold back, "
-            f"the picture's corner needs {needed_radius:.4f}; check k1 and k2 (and their radius unit)"
+            f"the lens folds inside the picture: no ray lands farther out than {fold_radius:.4f} focal lengths, "
+            f"and the picture's corner is at {corner_radius:.4f}; check k1 and k2 (and their radius unit)"
         )
 
 

@@ -152,18 +152,22 @@ class Lens:
         y = max(cv + 0.5, height - 0.5 - cv) / (self.pixel_aspect * self.f_px)
         return math.hypot(x, y)
 
-    def folds_inside(self) -> bool:
-        """Whether some pixel of the picture lies beyond the fold."""
+    def fold_radius(self) -> float:
+        """Largest DISTORTED radius (focal-length units) that any ray reaches; infinity if the lens never folds."""
         radius = self.valid_radius
         if math.isinf(radius):
-            return False
+            return math.inf
         r2 = radius * radius
-        return radius * (1 + self.k1 * r2 + self.k2 * r2 * r2) <= self.corner_radius()
+        return radius * (1 + self.k1 * r2 + self.k2 * r2 * r2)
+
+    def folds_inside(self) -> bool:
+        """Whether some pixel of the picture lies beyond the fold."""
+        return self.fold_radius() <= self.corner_radius()
 
     def require_unfolded(self) -> None:
         """Raise :class:`FoldedLens` when the fold lies inside the picture."""
         if self.folds_inside():
-            raise FoldedLens(self.valid_radius, self.corner_radius())
+            raise FoldedLens(self.fold_radius(), self.corner_radius())
 
     def distort(self, rays: FloatArray) -> FloatArray:
         """Undistorted rays (N, 2) to distorted ones (N, 2), NaN beyond :attr:`valid_radius`."""

@@ -40,10 +40,14 @@ class Role(StrEnum):
     FREE = "free"
 
 
+_FARTHEST = 1e5
+# Metres or degrees: 100 km, beyond any studio; larger numbers are a mistake and cost the fit its digits.
+
+
 def _finite(what: str, *values: float) -> None:
     for value in values:
-        if not math.isfinite(value):
-            raise InvalidInput(what, value, "must be a finite number")
+        if not math.isfinite(value) or abs(value) > _FARTHEST:
+            raise InvalidInput(what, value, f"must be a number between -{_FARTHEST:g} and {_FARTHEST:g}")
 
 
 def _sigma(what: str, value: float) -> None:

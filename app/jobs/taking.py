@@ -130,6 +130,7 @@ class PictureTaker:
         self._count(capture.source)
         seen = await self._cpu.run(thumbnail, picture)
         frozen = False
+        measured_s = self.delay.delay_s
         for attempt in range(_REFETCHES + 1):
             frozen = self._must_change and self._last is not None and not changed(self._last, seen)
             if not frozen or attempt == _REFETCHES:
@@ -138,6 +139,8 @@ class PictureTaker:
             picture = await self._fetch()
             self._count(capture.source)
             seen = await self._cpu.run(thumbnail, picture)
+        if frozen:
+            self.delay.delay_s = measured_s  # waiting longer has not helped: it is not the delay
         self._last, self._must_change = seen, False
         if self._head is None:
             self._head = await self.read_head()

@@ -6,14 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
+from calibration.detect.aliasing import LEAST_SHARE, crossing_covariance, edge_variance, unsmoothed_share
 from calibration.detect.corner import (
     PIXEL_VARIANCE_PX2,
     WINDOW_SHARE,
     CornerFit,
     CornerState,
     Signal,
+    Windows,
     cut_windows,
+    edge_softness,
     fit_corners,
     guess_sigma,
 )
@@ -34,7 +38,7 @@ from calibration.types import (
     TargetKind,
 )
 
-LEAST_SHARE = 0.8
+LEAST_MEASURED = 0.8
 """At least this share of the corners must be measured."""
 LARGEST_BLUR_SHARE = 0.27
 """A board whose blur (sigma) exceeds this share of a square's side is refused."""
@@ -42,6 +46,8 @@ _FIRST_HALF_PX = 6
 _SECOND_HALF_PX = 28
 _BAND_SIGMAS = 3.0
 _BAND_PX = 1.5
+_SLOPE_SPAN = 5
+_SOFTNESS_CORNERS = 16
 _GUESS_CORNERS = 12
 _FIRST_ITERATIONS = 8
 _SECOND_ITERATIONS = 6
@@ -53,7 +59,7 @@ def find_chessboard(
     """The inner corners of ``target`` in ``picture``, or a refusal with its reason.
 
     Corners that are hidden or cannot be measured are left out (``point_ids`` says which are there) while at least
-    ``LEAST_SHARE`` of them remain.
+    ``LEAST_MEASURED`` of them remain.
     """
     columns, rows = target.grid
     found = find_board(picture, (columns, rows), target.colours, near)
@@ -73,13 +79,14 @@ class _Measured:
     fit: CornerFit
     start_px: FloatArray
     side_px: NDArray[np.float64]  # (N,) the shorter of a corner's two steps
+    aliasing_px2: FloatArray  # (N, 2, 2) what pixels that were never smoothed add to the fit's covariance
 
 
 def _measure(signal: Signal, board: Board) -> _Measured:
     """Fit all corners twice: roughly from the coarse grid, then in windows that suit the blur and edges bent as the
     grid is.
     """
-    shape = board.points_px.shape[:2]
+    shape = (board.points_px.shape[0], board.points_px.shape[1])
     points = board.points_px.reshape(-1, 2)
     steps = steps_of(board.points_px).reshape(-1, 2, 2)
     parity = ((-1) ** np.add.outer(np.arange(shape[0]), np.arange(shape[1]))).ravel()
@@ -120,7 +127,30 @@ def _measure(signal: Signal, board: Board) -> _Measured:
     half = _half(steps, max(_SECOND_HALF_PX, round(3.5 * sigma)))
     windows = cut_windows(signal, second_start, steps, half, band_px=_BAND_SIGMAS * sigma + _BAND_PX)
     fit = fit_corners(signal, windows, second_start, _curvature(grid), iterations=_SECOND_ITERATIONS)
-    return _Measured(fit, points, side_px)
+    return _Measured(fit, points, side_px, _aliasing(windows, fit.state, steps, shape, half))
+
+
+def _aliasing(
+    windows: Windows, state: CornerState, steps_px: FloatArray, shape: tuple[int, int], half_px: int
+) -> FloatArray:
+    """(N, 2, 2) px^2 by which edges sharper than the pixels may be off alike over a whole window.
+
+    The residuals do not tell: where all pixels of an edge are cut at the same place, the fit is perfect. The slopes
+    are the grid's, over a few squares: a corner's own angles follow the pixel's step that is in its window.
+    ``shape``: the grid's rows and columns.
+    """
+    blur_variance = float(np.median(state.sigma_px)) ** 2 - PIXEL_VARIANCE_PX2
+    count = len(state.points_px)
+    some = np.unique(np.linspace(0, count - 1, min(count, _SOFTNESS_CORNERS)).astype(np.int64))
+    few = CornerState(*(values[some] for values in _parts(state)))
+    share = unsmoothed_share(edge_softness(windows.of(some), few), blur_variance)
+    if share < LEAST_SHARE:
+        return np.zeros((count, 2, 2))
+    lengths = np.minimum(2 * WINDOW_SHARE * np.linalg.norm(steps_px, axis=2), 2 * half_px)
+    smooth = uniform_filter(steps_px.reshape(*shape, 4), (_SLOPE_SPAN, _SLOPE_SPAN, 0), mode="nearest")
+    steps = smooth.reshape(-1, 2, 2)
+    angles = np.arctan2(steps[..., 1], steps[..., 0])
+    return share * crossing_covariance(angles, edge_variance(angles, lengths))
 
 
 def _parts(state: CornerState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -181,11 +211,11 @@ def _judged(measured: _Measured, signal: Signal, board: Board, target: Target) -
         & (state.sigma_px < max(2.5 * blur_all, blur_all + 1))
     )
     usable = _without_strays(usable, places, state.points_px)
-    if usable.sum() < LEAST_SHARE * total:
+    if usable.sum() < LEAST_MEASURED * total:
         return Refusal(f"only {int(usable.sum())} of {total} inner corners could be measured (hidden or too blurred)")
     ids = np.nonzero(usable)[0]
     points = state.points_px[ids]
-    covariance = fit.covariance_px2[ids] * np.maximum(fit.chi2[ids], 1.0)[:, None, None]
+    covariance = fit.covariance_px2[ids] * np.maximum(fit.chi2[ids], 1.0)[:, None, None] + measured.aliasing_px2[ids]
     blur = float(np.median(np.sqrt(np.maximum(state.sigma_px[ids] ** 2 - PIXEL_VARIANCE_PX2, 0.0))))
     contrast = 2 * typical / float(np.sqrt((signal.variance_dark + signal.variance_bright) / 2))
     scatter, differences = grid_scatter(places[ids], points)

@@ -214,6 +214,19 @@ def guess_sigma(windows: Windows, state: CornerState, largest_px: float) -> floa
     return best
 
 
+def edge_softness(windows: Windows, state: CornerState) -> float:
+    """Mean over the pixels within half a pixel of one edge alone of 1 - |2 v - 1|, v the light between the colours.
+
+    0 where every pixel is of one colour or the other, 0.5 where pixels are means over their area, more with a blur.
+    """
+    shape = _shape(windows, state, np.zeros((len(windows.centres), 2), dtype=np.float32))
+    near1, near2 = np.abs(shape.d1), np.abs(shape.d2)
+    chosen = (windows.used > 0) & (np.minimum(near1, near2) < 0.5) & (np.maximum(near1, near2) > 2.0)
+    offset, gain = state.offset.astype(np.float32)[:, None], state.gain.astype(np.float32)[:, None]
+    signed = np.abs((windows.values - offset) / np.where(gain == 0, np.float32(1), gain))[chosen]
+    return float(1 - np.minimum(signed, 1.0).mean()) if len(signed) else 1.0
+
+
 def fit_corners(
     signal: Signal,
     windows: Windows,

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from calibration.detect.aliasing import LEAST_SHARE, UNIFORM_VARIANCE_PX2, unsmoothed_share
 from calibration.detect.side import Curve, Side, meeting, start_curves
 from calibration.image import Transfer, light_table
 from calibration.types import FloatArray, Picture
@@ -31,7 +32,8 @@ from calibration.types import FloatArray, Picture
 _SQRT_2PI = math.sqrt(2 * math.pi)
 _QUANTISATION = 1 / math.sqrt(12)
 """Least noise of a coded value: that of rounding it to a whole number."""
-_LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.08, 40.0
+_LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.25, 40.0
+"""The box of a pixel alone has 0.29 px; a sharper model would hold the line of one cut pixel for exact."""
 # A side shorter than 24 px is bent by less than 0.01 px where the picture's edge is bent by 5 %; the third order
 # needs 60 px to show as much. (Lengths at which the order rises to 2 and to 4.)
 _QUADRATIC_FROM_PX, _QUARTIC_FROM_PX = 24.0, 60.0
@@ -166,6 +168,7 @@ class _Fit:
         self._offset = np.zeros(n)
         self._noise = np.ones(3)
         self._hessian = np.eye(1)
+        self._aliased = 0.0
 
     def _gather(self, picture: Picture, reach_px: float, margin_px: float, most_lines: int) -> _Lines:
         height, width = picture.shape[:2]
@@ -237,7 +240,7 @@ class _Fit:
         z = (x / scale)[:, None, :]
         shape = ndtr(z * lines.sign) * lines.neighbours
         if reweigh:
-            self._weigh(shape)
+            self._weigh(shape, x)
         # Derivatives of the shape by the edge's place and by log s.
         by_z = np.exp(-0.5 * z * z) * (lines.neighbours * (lines.sign / -_SQRT_2PI))
         by_blur, by_place = by_z * z, by_z / scale
@@ -268,6 +271,10 @@ class _Fit:
         self._contrast = np.sqrt((s0 * rise2).sum(axis=0) / np.maximum(pixels, 1))
         bound = 1.5 * scale + 0.2
         wanted = np.clip(pull_place / np.maximum(place_place, 1e-12), -bound, bound)
+        # A line of a picture with one sample a pixel tells its place to a pixel, however little noise it has.
+        left = 1 / (1 + place_place * (self._aliased * UNIFORM_VARIANCE_PX2))
+        self._information = place_place = place_place * left
+        place_blur = place_blur * left
         return self._solve(wanted, place_place, place_blur, blur_blur, wanted * place_place, pull_blur)
 
     def _centres(self) -> FloatArray:
@@ -276,7 +283,7 @@ class _Fit:
             table[index, : len(curve.coefficients)] = curve.coefficients
         return np.asarray(np.sum(self._lines.basis * table[self._lines.side], axis=1))
 
-    def _weigh(self, shape: FloatArray) -> None:
+    def _weigh(self, shape: FloatArray, off_px: FloatArray) -> None:
         """Inverse variances: the noise in coded values, measured on the residuals, as light at the model's level."""
         lines = self._lines
         weighted = lines.weight * shape
@@ -294,6 +301,23 @@ class _Fit:
                 spread = 1.4826 * _median(coded[:, channel][mask]) * freed
                 self._noise[channel] = max(spread, _QUANTISATION)
         lines.weight = lines.seen / (gain * self._noise[:, None]) ** 2
+        self._aliased = self._aliased_share(
+            ((lines.light - base) * rise).sum(axis=1), (rise * rise).sum(axis=0), off_px
+        )
+
+    def _aliased_share(self, products: FloatArray, squares: FloatArray, off_px: FloatArray) -> float:
+        """Share of the error of edges cut to whole pixels (see ``aliasing``): from the pixels within half of one.
+
+        ``products`` (m, n) of light above the base and rise, summed over channels; ``squares`` (n,) of the rise.
+        """
+        near = (np.abs(off_px) < 0.5) & (self._lines.neighbours[:, 0] > 0.98) & (self._trust > 0.5)
+        near &= (self._lines.seen[:, 0] > 0) & (squares > 0)
+        if not near.any():
+            return 0.0
+        value = np.clip((products / np.where(squares > 0, squares, 1.0))[near], 0.0, 1.0)
+        softness = float(np.mean(1 - np.abs(2 * value - 1)))
+        share = unsmoothed_share(softness, self.sigma**2 - UNIFORM_VARIANCE_PX2)
+        return share if share >= LEAST_SHARE else 0.0
 
     def _solve(
         self,
@@ -407,6 +431,9 @@ class _Fit:
                     coefficients=curve.coefficients,
                     covariance=covariance[block, block] * excess,
                     sigma_px=self.sigma,
+                    aliased=self._aliased,
+                    line_variance_px2=excess / max(_median(self._information[good]), 1e-12),
+                    density=(here.stop - here.start) / (2 * curve.half),
                     used=lines / (here.stop - here.start),
                     lines=lines,
                     chi2=float(np.median(self._chi2[good])),

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.types import FloatArray, Picture
+from calibration.types import FloatArray, IntArray, Picture
 
 Gray = NDArray[np.float32]
 
@@ -25,6 +25,7 @@ MOST_CANDIDATES = 1500
 _SECOND_HARMONIC_SHARE = 0.55
 _EIGENVALUE_RATIO = 0.08  # tan^2 of half the sharpest angle (about 32 deg) between a board's two edge directions
 _NOISE_FACTOR = 6.0
+_PEAK_REACH_PX = 2
 _RING_ANGLES = 2 * np.pi * np.arange(RING_SAMPLES) / RING_SAMPLES
 
 
@@ -66,6 +67,20 @@ def reduce_picture(picture: Picture, factor: int) -> Picture:
     return picture
 
 
+def _one_of_each_plateau(peaks: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the peaks less those within reach of an earlier one: such two are equal to the last bit.
+
+    A corner half way between pixels of a picture without noise is so symmetric that two or four pixels around it
+    share the maximum; each would then link a grid of its own. No peak may be nearer to the border than the reach.
+    """
+    rows, columns = np.nonzero(peaks)
+    repeated = np.zeros(len(rows), dtype=bool)
+    for down in range(-_PEAK_REACH_PX, 1):
+        for right in range(-_PEAK_REACH_PX, _PEAK_REACH_PX + 1 if down < 0 else 0):
+            repeated |= peaks[rows + down, columns + right]
+    return rows[~repeated], columns[~repeated]
+
+
 def find_saddles(gray: Gray) -> Saddles:
     """Corner candidates of ``gray`` (H, W) float32, coded values."""
     smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), dtype=np.float32)
@@ -75,11 +90,11 @@ def find_saddles(gray: Gray) -> Saddles:
     measure = xy * xy - xx * yy
     noise = float(np.median(np.abs(xy[::3, ::3]))) * 1.4826
     floor = (_NOISE_FACTOR * max(noise, 0.02)) ** 2
-    peak = cv2.dilate(measure, np.ones((5, 5), np.uint8))
+    peak = cv2.dilate(measure, np.ones((2 * _PEAK_REACH_PX + 1,) * 2, np.uint8))
     mask = (measure >= peak) & (measure > floor)
-    border = 2
+    border = _PEAK_REACH_PX
     mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = False, False, False, False
-    rows, columns = np.nonzero(mask)
+    rows, columns = _one_of_each_plateau(mask)
     if len(rows) > 4 * MOST_CANDIDATES:
         order = np.argsort(-measure[rows, columns], kind="stable")[: 4 * MOST_CANDIDATES]
         rows, columns = rows[order], columns[order]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.detect.aliasing import cut_variance
 from calibration.types import FloatArray
 
 SYSTEMATIC_PX, SYSTEMATIC_OF_BLUR = 0.006, 0.006
@@ -20,7 +21,8 @@ class Side:
     ``along_rows``: it is v = c(u), else u = c(v). With t = (x - middle) / half, c = sum of coefficients[i] t^i (px);
     ``covariance`` of the coefficients (px^2), without the systematic part. ``used``: share of the lines of pixels that
     fit; ``chi2``: their median squared residual over the noise; ``contrast``: median difference over the noise of
-    one pixel; ``sigma_px``: blur normal to the side, pixel included.
+    one pixel; ``sigma_px``: blur normal to the side, pixel included. ``aliased``: share (0..1) of the error of edges
+    cut to whole pixels; ``line_variance_px2``: what one line of pixels tells; ``density``: lines used for each pixel.
     """
 
     along_rows: bool
@@ -33,6 +35,9 @@ class Side:
     lines: int
     chi2: float
     contrast: float
+    aliased: float
+    line_variance_px2: float
+    density: float
 
     def at(self, x: float) -> tuple[float, float, float]:
         """Value c(x), slope dc/dx and variance of c at a coordinate along the side (px, 1, px^2)."""
@@ -40,6 +45,17 @@ class Side:
         powers = t ** np.arange(len(self.coefficients))
         slope = sum(i * c * t ** (i - 1) for i, c in enumerate(self.coefficients) if i) / self.half
         return float(powers @ self.coefficients), float(slope), float(powers @ self.covariance @ powers)
+
+    def aliasing(self, slope: float, spread_px2: float) -> float:
+        """Variance (px^2) at a place where the curve's is ``spread_px2``, by errors that neighbouring lines share.
+
+        As many lines count there as it takes for that variance: at the end of a curve of order k, 1 in (k + 1)^2.
+        """
+        if not self.aliased:
+            return 0.0
+        pixels = max(self.line_variance_px2 / (spread_px2 * self.density), 1.0)
+        steep = min(abs(slope), 1.0)
+        return self.aliased * float(cut_variance(np.array(steep), np.array(pixels)))
 
 
 @dataclass(slots=True, eq=False)
@@ -85,7 +101,9 @@ def corner_of(first: Side, second: Side, near: FloatArray) -> tuple[FloatArray, 
             value, slope, spread = side.at(float(x))
             rows.append([-slope, 1.0] if side.along_rows else [1.0, -slope])
             values.append(value - y)
-            variance[index] = spread + (SYSTEMATIC_PX + SYSTEMATIC_OF_BLUR * side.sigma_px) ** 2
+            variance[index] = (
+                spread + side.aliasing(slope, spread) + (SYSTEMATIC_PX + SYSTEMATIC_OF_BLUR * side.sigma_px) ** 2
+            )
         jacobian = np.array(rows)
         if abs(np.linalg.det(jacobian)) < 0.1:
             return None

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.camera import project_points, target_points_world
 from calibration.compare import predicted_overlay
-from calibration.errors import CalibrationError, InvalidInput, NotEnoughData
+from calibration.errors import CalibrationError, FoldedLens, InvalidInput, NotConverged, NotEnoughData
 from calibration.lens import Lens
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, solve_level
@@ -84,6 +84,7 @@ class JointMethod:
         self._views: list[View] = []
         self._left_out: list[LeftOut] = []
         self._fit: LevelFit | None = None
+        self._straight = False
         self._problem = ""
         self._probes = self._probe_order()
         self._target = ""
@@ -234,7 +235,7 @@ class JointMethod:
         count = len(self._views) + len(self._pending)
         if count >= self._options.max_views:
             return True
-        if count < self._options.min_views or self._fit is None:
+        if count < self._options.min_views or self._fit is None or self._straight:
             return False
         return predicted_overlay(self._fit.lens, self._fit.covariance).max_px <= self._options.goal_px
 
@@ -262,7 +263,8 @@ class JointMethod:
     def _planning_lens(self) -> Lens:
         """The fitted lens; while one picture in the middle tells its bend badly, that of the guess, or none at all."""
         lens = self._lens()
-        if self._fit is not None and predicted_overlay(lens, self._fit.covariance).max_px <= _BEND_KNOWN_PX:
+        fit = self._fit
+        if fit is not None and not self._straight and predicted_overlay(lens, fit.covariance).max_px <= _BEND_KNOWN_PX:
             return lens
         guess = self._task.guess
         straight = Lens(
@@ -359,12 +361,23 @@ class JointMethod:
         self._views.append(View(name, capture.target, target, detection, observation.camera_pose))
 
     def _solve(self) -> None:
-        self._fit = solve_level(
+        """Fit the pictures so far. The first ones hardly tell the bend: where it then comes out as a fold, it is held
+        at 0 until more pictures have come."""
+        try:
+            self._fit, self._straight = self._solved(straight=False), False
+        except (FoldedLens, NotConverged):
+            if len(self._views) >= self._options.min_views:
+                raise
+            self._fit, self._straight = self._solved(straight=True), True
+
+    def _solved(self, *, straight: bool) -> LevelFit:
+        return solve_level(
             self._views,
             self._task.image_size,
             pixel_aspect=self._task.pixel_aspect,
             nodal_offset_mm=self._task.nodal_offset_mm,
             nodal_sigma_mm=self._task.nodal_sigma_mm,
+            straight=straight,
         )
 
     def _lens(self) -> Lens:

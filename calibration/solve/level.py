@@ -34,6 +34,7 @@ _ODD_SHARE = 0.2
 # Leaving one picture out must take the floor down to this share of it before that picture is blamed.
 _NODAL_SIGNIFICANT = 4.0
 # Sigmas by which the pictures must contradict the nodal offset that was given before theirs is used instead.
+_BEND = ("k1", "k2")
 _USELESS_OF_WIDTH = 0.1
 # With every pose free, an expected error above this share of the width means that even the field of view is a guess.
 _UNTOLD = 0.3
@@ -48,12 +49,14 @@ def solve_level(
     nodal_offset_mm: float = 0.0,
     nodal_sigma_mm: float = 0.0,
     guess: Lens | None = None,
+    straight: bool = False,
 ) -> LevelFit:
     """Fit one lens to all pictures of a level. Raises :class:`calibration.errors.CalibrationError`.
 
     ``nodal_offset_mm`` stands unless the pictures contradict it; with a ``nodal_sigma_mm`` it is only a prior, and what
     the pictures and the prior leave open shows in the covariance. ``guess`` is a lens to start from; without one the
-    start is found from the pictures alone.
+    start is found from the pictures alone. ``straight`` holds k1 and k2 at 0: for the first pictures, which tell only
+    where to look next.
     """
     if not views:
         raise NotEnoughData("no picture of this level shows its target")
@@ -61,7 +64,7 @@ def solve_level(
     if len(set(names)) != len(names):
         raise InvalidInput("picture names", names, "each view needs a name of its own")
     try:
-        fit = _solve(views, image_size, pixel_aspect, nodal_offset_mm, nodal_sigma_mm, guess)
+        fit = _solve(views, image_size, pixel_aspect, nodal_offset_mm, nodal_sigma_mm, guess, _BEND if straight else ())
     except np.linalg.LinAlgError as error:
         raise NotConverged("the level's fit (its equations are singular)", 0, math.nan) from error
     fit.lens.require_unfolded()
@@ -82,12 +85,13 @@ def _solve(
     nodal_offset_mm: float,
     nodal_sigma_mm: float,
     guess: Lens | None,
+    bend: tuple[str, ...],
 ) -> LevelFit:
     kept, dropped = list(views), []
     while True:
         _require_enough(kept)
         lens, poses = start(kept, image_size, pixel_aspect, nodal_offset_mm, guess)
-        fitted = Fit(kept, lens, poses, nodal_sigma_mm=nodal_sigma_mm or PRIOR_NODAL_MM)
+        fitted = Fit(kept, lens, poses, held=bend, nodal_sigma_mm=nodal_sigma_mm or PRIOR_NODAL_MM)
         fitted.run()
         bad = fitted.worst_view() if len(kept) > 2 else None
         if bad is None:
@@ -104,10 +108,10 @@ def _solve(
         if not nodal_told:
             # What contradicts nothing stays as given: left free, it would only take exactness from the field of view.
             given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
-            fitted = Fit(kept, given, fitted.free_poses(), held=("nodal_offset_mm",))
+            fitted = Fit(kept, given, fitted.free_poses(), held=(*bend, "nodal_offset_mm"))
             fitted.run()
             fit = fitted.result(tuple(dropped))
-    untold = _untold(fit)
+    untold = () if bend else _untold(fit)
     if untold:
         held = untold if nodal_told else (*untold, "nodal_offset_mm")
         again = Fit(kept, fit.lens, fitted.free_poses(), held=held)

@@ -27,6 +27,14 @@ from calibration.types import FloatArray
 USABLE_OVERLAY_PX = 1.0
 """Expected overlay error above which a level is called degraded: a shift that a viewer begins to see."""
 
+USELESS_OF_WIDTH = 0.25
+"""Expected overlay error, as a share of the picture's width, above which a level has no numbers at all."""
+
+ENGINE_AGREES_PX = 0.15
+"""Corners of the engine's render this far from the camera's are more than detectors and noise can do."""
+
+_OUTLIER_SHARE = 0.03
+_FEWEST_OUTLIERS = 3
 _ON_AXIS = 1e-4
 # Tangent of the angle off the optical axis under which a thing counts as on it: half a pixel at 5,000 px.
 _NODAL_LOOSE_MM = 2.0
@@ -58,6 +66,9 @@ def level_result(
 ) -> LevelResult:
     """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it."""
     expected = predicted_overlay(fit.lens, fit.covariance)
+    every_left_out = (*left_out, *(LeftOut(name, why) for name, why in fit.dropped), *_outliers(fit))
+    if why := _useless(fit, expected.max_px):
+        return LevelResult.failed(zoom, focus, why, left_out=every_left_out)
     held = pixel_error(list(held_out.values()))
     reasons = {name: "the pictures do not show it; taken as 0" for name in fit.untold}
     if fit.nodal_seen_mm is None:
@@ -73,7 +84,6 @@ def level_result(
         reasons["engine_overlay_px"] = engine_reason
     trouble = _trouble(fit, expected.max_px, engine_overlay_px)
     sigma = fit.sigma
-    all_left_out = [*left_out, *(LeftOut(name, why) for name, why in fit.dropped), *_outliers(fit)]
     return LevelResult.from_lens(
         zoom,
         focus,
@@ -93,7 +103,7 @@ def level_result(
         predicted_overlay_px=PixelError(expected.rms_px, expected.max_px),
         engine_overlay_px=engine_overlay_px,
         scenario=1 if edge_effect_px(fit.lens)[1] <= NEGLIGIBLE_PX else 2,
-        left_out=tuple(all_left_out),
+        left_out=every_left_out,
     )
 
 
@@ -105,6 +115,19 @@ def _outliers(fit: LevelFit) -> list[LeftOut]:
         LeftOut(name, f"{len(far)} of its points left out: up to {max(far):.2f} px from where all others put them")
         for name, far in by_picture.items()
     ]
+
+
+def _useless(fit: LevelFit, expected_max_px: float) -> str | None:
+    """Why the level's numbers must not be used at all, or None."""
+    if not expected_max_px <= USELESS_OF_WIDTH * fit.lens.image_size[0]:
+        return (
+            f"the pictures do not tell the lens (expected overlay error up to {expected_max_px:.0f} px): take more, "
+            "with the target in the corners, or check the poses"
+        )
+    share = len(fit.outliers) / max(fit.points + len(fit.outliers), 1)
+    if len(fit.outliers) >= _FEWEST_OUTLIERS and share > _OUTLIER_SHARE:
+        return f"{share:.0%} of the points disagree with the rest: a pose, the survey or the pictures are wrong"
+    return None
 
 
 def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -> list[str]:
@@ -132,10 +155,7 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
                 f"the pictures hint at a nodal offset of {seen_mm:.0f} ± {sigma_mm:.0f} mm, not "
                 f"{fit.lens.nodal_offset_mm:g} mm; if so the field of view is off: add a target at another distance"
             )
-    share = len(fit.outliers) / max(fit.points + len(fit.outliers), 1)
-    if share > 0.03:
-        trouble.append(f"{share:.0%} of the points disagree with the rest")
-    if engine is not None and engine.max > max(USABLE_OVERLAY_PX, 5 * expected_max_px):
+    if engine is not None and engine.max > max(ENGINE_AGREES_PX, 5 * expected_max_px, 6 * fit.rms_px):
         trouble.append(
             f"the engine's render is up to {engine.max:.1f} px off at these values: its lens model is not the "
             "profile's (check the radius unit of k1 and k2, the centre shift's sign and origin, the FoV's axis)"

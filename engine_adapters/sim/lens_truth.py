@@ -7,6 +7,7 @@ FoV or k1 themselves; outside the levels the nearest one holds.
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,7 @@ from engine_adapters.sim.optics import Optics
 
 _REQUIRED = ("zoom", "focus", "fov_x_deg")
 _OPTIONAL = {"k1": 0.0, "k2": 0.0, "nodal_offset_mm": 0.0, "blur_px": 0.6, "noise_sigma": 2.0}
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "center_shift_px")
 MAX_PICTURE_SIDE = 8192
 """The longest side of a simulated picture: beyond 8K it is a mistake."""
 MAX_LEVELS = 10_000
@@ -225,6 +227,10 @@ def _level(raw: object, where: str, image_size: tuple[int, int], aspect: float) 
     for name in _REQUIRED:
         if name not in raw:
             raise SimulatorError(f"{name} is missing", where=where)
+    for name in raw:
+        like = difflib.get_close_matches(str(name), _KNOWN, n=1, cutoff=0.8)
+        if name not in _KNOWN and like:
+            raise SimulatorError(f"field {str(name)[:40]!r} is not known; is {like[0]!r} meant?", where=where)
     values = {name: _number(raw[name], name, where) for name in _REQUIRED}
     for name, default in _OPTIONAL.items():
         values[name] = _number(raw.get(name, default), name, where)
