@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.engines import Engines, Studio
+from app.engines import Engines, PictureFacts, Studio
 from app.events import EventBroker
 from app.jobs.cpu import Cpu
 from app.jobs.runner import JobRunner
@@ -71,7 +71,8 @@ def add_engine(
     """Make a profile's engine known under ``name``."""
     require_available(profile)
     address = f"r3 {profile.r3.host}:{profile.r3.port}, pictures {profile.mockboard.url}"
-    engines.add(name, address, lambda: make_studio(profile, ask, slow_pictures=slow_pictures))
+    pictures = PictureFacts(profile.picture.image_size, profile.picture.pixel_aspect)
+    engines.add(name, address, lambda: make_studio(profile, ask, slow_pictures=slow_pictures), pictures)
 
 
 def load_engines(paths: Sequence[Path]) -> Engines:

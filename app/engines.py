@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 from app.errors import ServiceError
 from calibration.image import Transfer
@@ -29,6 +30,19 @@ class EngineInUse(EngineError):
     """Another job holds the engine."""
 
 
+class StudioMismatch(EngineError):
+    """A job says another thing of the engine's pictures than its studio profile. The message names both values."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureFacts:
+    """What a studio profile says of its pictures: width and height in px, vertical over horizontal focal length in
+    pixels."""
+
+    image_size: tuple[int, int]
+    pixel_aspect: float
+
+
 @dataclass(frozen=True, slots=True)
 class Studio:
     """What a job talks to: an engine, its output, and what turns the camera. ``transfer``: how pictures code light."""
@@ -47,18 +61,21 @@ class Studio:
 
 @dataclass(frozen=True, slots=True)
 class EngineInfo:
-    """An engine as shown to clients. ``dirty``: why its values may not be as they were found, or None."""
+    """An engine as shown to clients. ``dirty``: why its values may not be as they were found, or None; ``found``: then
+    the (name, value) pairs that are to be put back."""
 
     name: str
     address: str
     job_id: str | None
     dirty: str | None
+    found: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(slots=True)
 class _Slot:
     address: str
     connect: Callable[[], Studio]
+    pictures: PictureFacts | None
     job_id: str | None = None
     dirty: str | None = None
     found: EngineState | None = None
@@ -80,21 +97,43 @@ class Engines:
     def __init__(self) -> None:
         self._slots: dict[str, _Slot] = {}
 
-    def add(self, name: str, address: str, connect: Callable[[], Studio]) -> None:
-        """Make an engine known. ``connect`` makes its adapters; connections are opened at their first use."""
-        self._slots[name] = _Slot(address, connect)
+    def add(self, name: str, address: str, connect: Callable[[], Studio], pictures: PictureFacts | None = None) -> None:
+        """Make an engine known. ``connect`` makes its adapters; connections are opened at their first use.
+
+        ``pictures``: what its profile says of its pictures, for :meth:`require_pictures`; None: nothing is known.
+        """
+        self._slots[name] = _Slot(address, connect, pictures)
 
     def names(self) -> Iterable[str]:
         return tuple(self._slots)
 
     def infos(self) -> list[EngineInfo]:
-        return [EngineInfo(name, slot.address, slot.job_id, slot.dirty) for name, slot in self._slots.items()]
+        return [
+            EngineInfo(name, slot.address, slot.job_id, slot.dirty, slot.found.exports if slot.found else ())
+            for name, slot in self._slots.items()
+        ]
 
     def require(self, name: str) -> None:
         """Raise :class:`UnknownEngine` unless there is an engine of this name."""
         if name not in self._slots:
             known = ", ".join(sorted(self._slots)) or "none"
             raise UnknownEngine(f"no engine is called {name!r}; this service knows: {known}")
+
+    def require_pictures(self, name: str, wanted: PictureFacts) -> None:
+        """Raise :class:`StudioMismatch` unless a job and the engine's profile say the same of its pictures.
+
+        A job solved with another pixel aspect than the engine renders with would be wrong without a sign of it.
+        Raises :class:`UnknownEngine` too.
+        """
+        self.require(name)
+        known = self._slots[name].pictures
+        if known is None:
+            return
+        if wanted.image_size != known.image_size:
+            told, said = ("x".join(map(str, size)) for size in (wanted.image_size, known.image_size))
+            _mismatch("image_size", told, said)
+        if not math.isclose(wanted.pixel_aspect, known.pixel_aspect, rel_tol=1e-9):
+            _mismatch("pixel_aspect", f"{wanted.pixel_aspect:.12g}", f"{known.pixel_aspect:.12g}")
 
     @asynccontextmanager
     async def lease(self, name: str, job_id: str) -> AsyncIterator[Lease]:
@@ -143,6 +182,12 @@ class Engines:
         except (AdapterError, TimeoutError) as error:
             lease.problem = str(error) or f"not within {RESTORE_BOUND_S:g} s"
             slot.found, slot.dirty = lease.found, lease.problem
+
+
+def _mismatch(field: str, job: str, profile: str) -> NoReturn:
+    raise StudioMismatch(
+        f"the job's {field} {job} is not the studio profile's {profile} ([picture] {field}): correct one of them"
+    )
 
 
 async def _finish_shielded(work: Coroutine[Any, Any, None]) -> None:

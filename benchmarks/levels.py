@@ -48,7 +48,7 @@ async def _run(quick: bool, progress: Progress) -> list[Row]:
     rows: list[Row] = []
     totals: dict[str, Row] = {}
     async with launched_studio(("--lens", lens.name, "--payload-format", "jpeg")) as addresses:
-        engines = studio_engines(studio_profile(addresses, lens.image_size))
+        engines = studio_engines(studio_profile(addresses, lens))
         for index, method in enumerate(METHODS):
             with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
                 settings = Settings(database=Path(folder) / "bench.db")
@@ -145,7 +145,7 @@ def _study(joint: Row, levels: int) -> Row:
 async def _slow_way(lens: ZoomLens, level: tuple[float, float]) -> Row:
     """One level with pictures as the study first took them: snapshots on the engine's disk, 0.3 s each."""
     async with launched_studio(("--lens", lens.name, "--payload-format", "jpeg")) as addresses:
-        profile = studio_profile(addresses, lens.image_size)
+        profile = studio_profile(addresses, lens)
         with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
             settings = Settings(database=Path(folder) / "bench.db")
             engines = studio_engines(profile, slow_pictures=True)

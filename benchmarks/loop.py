@@ -37,7 +37,7 @@ async def _run(quick: bool, progress: Progress) -> list[dict[str, object]]:
             await asyncio.sleep(_IDLE_S)
             rows.append(_row("idle", lags))
             lags.clear()
-            engines = studio_engines(studio_profile(addresses, lens.image_size))
+            engines = studio_engines(studio_profile(addresses, lens))
             with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
                 settings = Settings(database=Path(folder) / "bench.db")
                 request = studio_job(addresses, lens, levels)

@@ -58,6 +58,7 @@ PROBLEMS: dict[str, Kind] = {
     "media-type": Kind(415, "The body is of a type not taken here"),
     "invalid": Kind(422, "The request has wrong fields"),
     "unknown-engine": Kind(422, "There is no such engine"),
+    "studio-mismatch": Kind(422, "The job and the engine's studio profile disagree"),
     "idempotency-conflict": Kind(422, "The idempotency key belongs to another request"),
     "queue-full": Kind(429, "Too many jobs are waiting", retry=True),
     "internal": Kind(500, "A mistake of the service"),
@@ -72,6 +73,7 @@ PROBLEMS: dict[str, Kind] = {
 _ERRORS: dict[type[Exception], str] = {
     engines.UnknownEngine: "unknown-engine",
     engines.EngineInUse: "engine-busy",
+    engines.StudioMismatch: "studio-mismatch",
     engines.EngineError: "conflict",
     QueueFull: "queue-full",
     TooManyListeners: "too-many-listeners",

@@ -44,7 +44,15 @@ def require_json(request: Request) -> None:
     dependencies=[Depends(require_json)],
     responses={
         201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}},
-        **responses("body-too-large", "media-type", "invalid", "unknown-engine", "idempotency-conflict", "queue-full"),
+        **responses(
+            "body-too-large",
+            "media-type",
+            "invalid",
+            "unknown-engine",
+            "studio-mismatch",
+            "idempotency-conflict",
+            "queue-full",
+        ),
         **responses("storage-full"),
     },
 )

@@ -24,11 +24,11 @@ def bench(
     quick: Annotated[bool, typer.Option("--quick", help="a small share of the cases, to see that it runs")] = False,
 ) -> None:
     """Run the benchmarks and print their figures beside those of the study's method and of public tools."""
-    for name in names or ():
-        if name not in BENCHMARKS:
-            wrong_usage(f"no benchmark is called {name!r}; there are: {', '.join(BENCHMARKS)}")
-    chosen = [BENCHMARKS[name] for name in dict.fromkeys(names or BENCHMARKS)]
-    with reported_errors():
+    with reported_errors(json_out == "-"):
+        for name in names or ():
+            if name not in BENCHMARKS:
+                wrong_usage(f"no benchmark is called {name!r}; there are: {', '.join(BENCHMARKS)}")
+        chosen = [BENCHMARKS[name] for name in dict.fromkeys(names or BENCHMARKS)]
         out = Path(json_out) if json_out not in (None, "-") else None
         check_out(out)
         documents = []

@@ -50,7 +50,7 @@ def calibrate(
     Prints each level with its sigmas and errors. Pictures of no use are left out with their reasons; a level with too
     little left fails with its reason and the others go on.
     """
-    with reported_errors():
+    with reported_errors(as_json):
         check_out(out, report)
         if picture_set.is_dir() and not (picture_set / "set.json").is_file():
             raise WorkFailed(f"{picture_set}: there is no set.json in this folder; write one, it says what is pictured")
@@ -86,7 +86,7 @@ async def _calibrate(
     finally:
         cpu.close()
     if not any(_is_measured(level.result) for level in levels):
-        raise WorkFailed(_why_nothing(described, levels))
+        raise WorkFailed(_why_nothing(described, levels), [level.result for level in levels])
     return replace(table_of(described, levels, utc_now()), method=method.value), levels
 
 
@@ -95,8 +95,14 @@ def _is_measured(result: LevelResult) -> bool:
 
 
 def _why_nothing(described: PictureSet, levels: list[SetLevel]) -> str:
-    reasons = dict.fromkeys(level.result.reason or "unknown" for level in levels)
-    left_out = [f"{left.picture}: {left.reason}" for level in levels for left in level.result.left_out]
-    told = "; ".join(reasons)
+    """The reasons of the levels, and the first pictures left out that these do not name already; each reason once."""
+    told = "; ".join(dict.fromkeys(level.result.reason or "unknown" for level in levels))
+    left_out = []
+    for left in (left for level in levels for left in level.result.left_out):
+        twice = f"{left.picture}: {left.picture}: "
+        line = f"{left.picture}: {left.reason}".replace(twice, twice[len(left.picture) + 2 :])
+        told = told.replace(twice, twice[len(left.picture) + 2 :])
+        if line not in told and line not in left_out:
+            left_out.append(line)
     more = f" (left out: {'; '.join(left_out[:3])}{' ...' if len(left_out) > 3 else ''})" if left_out else ""
     return f"{described.lens}: no level could be measured: {told}{more}"

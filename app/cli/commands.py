@@ -152,7 +152,8 @@ def _root(
 ) -> None:
     """Lens calibration for broadcast and virtual production: pictures in, lens table out.
 
-    Exit codes: 0 done, 1 the work failed (with the reason), 2 wrong usage.
+    Exit codes: 0 done, 1 the work failed (with the reason), 2 wrong usage. With --json work that failed prints one JSON
+    document too: its "error" is the line of standard error, its "levels", where there are any, are those that failed.
     """
     if verbose:
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")

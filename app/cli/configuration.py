@@ -7,21 +7,21 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from app.cli.console import EXIT_USAGE, fail
+from app.cli.console import wrong_usage
 from app.documents import one_line
 from app.settings import PREFIX, Settings
 from engine_adapters.profile import StudioProfile, load_profile
 
 
 def build_settings(**given: Any) -> Settings:
-    """The settings of the environment with those given on the command line (None: not given). Exits with 2."""
+    """The settings of the environment with those given on the command line (None: not); wrong ones exit with 2."""
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         problem = one_line(error)
         name = problem.partition(":")[0].partition(".")[0]
         source = "the command line" if given.get(name) is not None else f"{PREFIX}{name.upper()}"
-        fail(f"setting {problem}; it comes from {source}", EXIT_USAGE)
+        wrong_usage(f"setting {problem}; it comes from {source}")
 
 
 def studio_profile(path: Path | None, settings: Settings) -> tuple[StudioProfile, str]:

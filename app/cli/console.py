@@ -10,7 +10,7 @@ import contextlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,6 +23,7 @@ from app.documents import DocumentError
 from app.engines import EngineError
 from app.errors import ServiceError
 from calibration.errors import CalibrationError
+from calibration.tables import LevelResult, LevelStatus
 from engine_adapters.errors import AdapterError
 from storage.errors import StorageError
 
@@ -38,21 +39,55 @@ Show = Callable[[float, str], None]
 """Told how far the work is (0..1) and what is being done."""
 
 
+_printed = [0]
+"""How many JSON documents went to standard output in this process."""
+
+
 class WorkFailed(Exception):
-    """The work failed for a reason that has been told or is the message; the command exits with 1."""
+    """The work failed, and the message is why; the command exits with 1. ``levels``: what became of each, if known."""
+
+    def __init__(self, message: str, levels: Iterable[LevelResult] = ()) -> None:
+        self.levels = tuple(levels)
+        super().__init__(message)
+
+
+class WrongUsage(Exception):
+    """The command line asks for what there is not; the command exits with 2."""
 
 
 @contextlib.contextmanager
-def reported_errors() -> Iterator[None]:
-    """Turn expected errors into one line on standard error and the right exit code."""
+def reported_errors(as_json: bool = False) -> Iterator[None]:
+    """Turn expected errors into one line on standard error and the right exit code.
+
+    With ``as_json`` also into the JSON document ``{"error": line}`` on standard output, with the failed ``levels``
+    where they are known, unless the command has printed its own document already.
+    """
+    before = _printed[0]
+    code, levels = EXIT_FAILED, []
     try:
         yield
+        return
+    except WrongUsage as error:
+        told, code = str(error), EXIT_USAGE
     except (*KNOWN_ERRORS, WorkFailed) as error:
-        fail(str(error) or type(error).__name__, EXIT_FAILED)
+        told = str(error) or type(error).__name__
+        levels = failed_levels(error.levels) if isinstance(error, WorkFailed) else []
     except OSError as error:
-        fail(os_reason(error), EXIT_FAILED)
+        told = os_reason(error)
     except KeyboardInterrupt:
-        fail("interrupted; what was finished is kept", EXIT_FAILED)
+        told = "interrupted; what was finished is kept"
+    if as_json and _printed[0] == before:
+        print_json({"error": _flat(told)} | ({"levels": levels} if levels else {}))
+    fail(told, code)
+
+
+def failed_levels(levels: Iterable[LevelResult]) -> list[dict[str, Any]]:
+    """The levels that failed, each with its reason, as JSON documents tell them."""
+    return [
+        {"zoom": level.zoom, "focus": level.focus, "reason": level.reason or "unknown"}
+        for level in levels
+        if level.status is LevelStatus.FAILED
+    ]
 
 
 def os_reason(error: OSError) -> str:
@@ -70,8 +105,13 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def wrong_usage(message: str) -> NoReturn:
-    """Say what is wrong with the command line and exit with 2."""
-    fail(message, EXIT_USAGE)
+    """Say what is wrong with the command line and exit with 2; inside :func:`reported_errors`."""
+    raise WrongUsage(message)
+
+
+def warn(message: str) -> None:
+    """A line for a person of what needs their hand."""
+    messages.print(f"[bold yellow]warning:[/] {_one_line(message)}")
 
 
 def say(message: str) -> None:
@@ -83,6 +123,7 @@ def print_json(document: Any) -> None:
     """One JSON document on standard output; NaN and infinity, which JSON has not, are an error of ours."""
     sys.stdout.write(json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     sys.stdout.flush()
+    _printed[0] += 1
 
 
 def check_out(*paths: Path | None) -> None:
@@ -174,4 +215,8 @@ def progress_lines(title: str, each: float | None = None) -> Iterator[Show]:
 
 def _one_line(text: str) -> str:
     """Text with rich's markup signs made plain, on one line."""
-    return escape(" ".join(text.split()))
+    return escape(_flat(text))
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())

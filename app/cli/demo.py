@@ -35,6 +35,7 @@ from app.cli.simulated import (
     study_levels,
     true_lens,
 )
+from app.cli.tables import tell_failed
 from app.report import LevelReport, RunReport, write_report
 from app.settings import Settings
 from calibration.compare import Overlay, overlay
@@ -77,9 +78,9 @@ def demo(
         for name in embedded_lens_names():
             results.print(name)
         return
-    if lens not in embedded_lens_names():
-        wrong_usage(f"no simulated lens is called {lens!r}; there are: {', '.join(embedded_lens_names())}")
-    with reported_errors():
+    with reported_errors(as_json):
+        if lens not in embedded_lens_names():
+            wrong_usage(f"no simulated lens is called {lens!r}; there are: {', '.join(embedded_lens_names())}")
         out.mkdir(parents=True, exist_ok=True)
         truth = load_embedded(lens)
         levels = study_levels(zooms, focuses)
@@ -99,6 +100,7 @@ def demo(
             truth_at=partial(true_lens, truth),
         )
         write_report(out / "report.html", report)
+        tell_failed(job.table.levels)
         if as_json:
             print_json(_document(job, truth, judged, use, seconds))
         else:
@@ -122,7 +124,7 @@ async def _run(
         *("--payload-format", "jpeg"),
     ]
     async with launched_studio(options) as addresses:
-        engines = studio_engines(studio_profile(addresses, truth.image_size))
+        engines = studio_engines(studio_profile(addresses, truth))
         job = await run_job(settings, engines, studio_job(addresses, truth, levels), show)
         return job, await studio_use(addresses, PICTURE_TIME_MS / 1000, DELAY_FRAMES)
 
@@ -201,7 +203,6 @@ def _add_rows(table: Table, j: Judged) -> None:
     place = (f"{r.zoom:.3f}", f"{r.focus:.2f}")
     if r.fov_x_deg is None or j.error is None:
         table.add_row(*place, "[red]failed[/]")
-        say(f"zoom {r.zoom:.3f}, focus {r.focus:.2f} failed: {r.reason}")
         return
     shift = r.center_shift_px or (None, None)
     colour = "green" if j.error.max_px <= GOAL_PX else "yellow"

@@ -41,9 +41,9 @@ def detect(
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON document on standard output")] = False,
 ) -> None:
     """Find a target in a picture: its points in px with covariance, blur and quality."""
-    wanted = _target(target)
     light = transfer or (Transfer.SRGB if picture.suffix.lower() in (".jpg", ".jpeg") else Transfer.BT709)
-    with reported_errors():
+    with reported_errors(as_json):
+        wanted = _target(target)
         check_out(picture_out)
         try:
             pixels = _read(picture)
@@ -88,7 +88,7 @@ def _read(path: Path) -> Picture:
 
 def _not_found(reason: str, as_json: bool) -> NoReturn:
     if as_json:
-        print_json({"found": False, "reason": reason})
+        print_json({"found": False, "reason": reason, "error": f"not found: {reason}"})
         raise typer.Exit(EXIT_FAILED)
     fail(f"not found: {reason}", EXIT_FAILED)
 

@@ -21,14 +21,13 @@ from app.bootstrap import DEFAULT_ENGINE, make_studio, utc_now
 from app.cli.configuration import build_settings, studio_profile
 from app.cli.console import (
     EXIT_FAILED,
-    EXIT_USAGE,
     KNOWN_ERRORS,
-    fail,
     messages,
     os_reason,
     print_json,
     reported_errors,
     results,
+    wrong_usage,
 )
 from app.engines import Engines, Studio
 from app.jobs.cpu import Cpu
@@ -90,12 +89,13 @@ def doctor(
 ) -> None:
     """Check Python, database, disk, engine, MockBoard and camera head, and say what to do about what fails."""
     if print_profile:
-        if as_json:
-            fail("--print-profile prints TOML; leave out --json", EXIT_USAGE)
+        with reported_errors(as_json):
+            if as_json:
+                wrong_usage("--print-profile prints TOML; leave out --json")
         results.file.write(profile_toml())
         return
-    settings = build_settings(database=database)
-    with reported_errors():
+    with reported_errors(as_json):
+        settings = build_settings(database=database)
         profile, source = studio_profile(studio, settings)
         checks = asyncio.run(_checks(settings, profile, source, measure_delay))
         ok = all(check.ok for check in checks)

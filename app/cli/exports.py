@@ -28,8 +28,8 @@ def export_table(
     as_json: AsJson = False,
 ) -> None:
     """Write a lens table in another format. What the format cannot hold is said, not dropped in silence."""
-    export = _export(format_name)
-    with reported_errors():
+    with reported_errors(as_json):
+        export = _export(format_name)
         check_out(out)
         read = _read(table, EXPORTS["json"])
         write_file(out, export.write(read))
@@ -48,8 +48,8 @@ def import_table(
     as_json: AsJson = False,
 ) -> None:
     """Read a lens table from another format, check it, and show it or write it as JSON."""
-    export = _export(format_name)
-    with reported_errors():
+    with reported_errors(as_json):
+        export = _export(format_name)
         check_out(out)
         table = _read(path, export)
         if out is not None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from app.bootstrap import Service, running_service
-from app.cli.console import Show, WorkFailed
+from app.cli.console import Show, WorkFailed, warn
 from app.documents import JobRequest
-from app.engines import Engines
+from app.engines import EngineInfo, Engines
 from app.events import TERMINAL_KINDS, message
 from app.settings import Settings
-from calibration.tables import LensTable, LevelStatus
+from calibration.tables import LensTable, LevelResult, LevelStatus
 from storage.errors import NotFound
 from storage.records import JobState, PictureKind
 
@@ -34,18 +35,30 @@ class FinishedJob:
 async def run_job(settings: Settings, engines: Engines, request: JobRequest, show: Show) -> FinishedJob:
     """Run a job to its end. Raises WorkFailed with the job's reason.
 
-    Interrupted, it cancels the job first: the engine gets its values back and finished levels stay in the store.
+    Interrupted, it cancels the job first: the engine gets its values back and finished levels stay in the store; the
+    WorkFailed says where. An engine whose values could not be put back is told in a line of its own.
     """
     async with running_service(settings, engines) as service:
         record = await service.runner.submit(request)
+        interrupted = False
         try:
             await _follow(service, record.id, len(request.levels), show)
         except asyncio.CancelledError:
+            interrupted = True
             await service.runner.cancel(record.id)
-            raise
+            await _follow(service, record.id, len(request.levels), lambda share, doing: None)
+        engine = next(info for info in engines.infos() if info.name == request.engine)
+        if engine.dirty is not None:
+            warn(_by_hand(engine, engine.dirty))
         record = await service.repository.get_job(record.id)
+        results = [level.result for level in await service.repository.list_levels(record.id)]
+        if interrupted:
+            where = f"job {record.id} in {settings.database}, {_measured(results)} of {len(request.levels)} levels"
+            put_back = "has its values back" if engine.dirty is None else "does not have its values back"
+            raise WorkFailed(f"interrupted; what was finished is kept: {where}; the engine {put_back}", results)
         if record.state is not JobState.DONE:
-            raise WorkFailed(f"the job {record.state.value}: {record.reason}{await _kept(service, record.id)}")
+            kept = _kept(results, record.id, settings)
+            raise WorkFailed(f"the job {record.state.value}: {record.reason}{kept}", results)
         summary = await service.repository.table_of_job(record.id)
         if summary is None:
             raise WorkFailed(f"job {record.id} is done but left no table; the store may have been changed meanwhile")
@@ -53,10 +66,19 @@ async def run_job(settings: Settings, engines: Engines, request: JobRequest, sho
         return FinishedJob(record.id, table, await _pictures(service, record.id))
 
 
-async def _kept(service: Service, job_id: str) -> str:
-    levels = await service.repository.list_levels(job_id)
-    measured = sum(level.result.status is not LevelStatus.FAILED for level in levels)
-    return f" ({measured} finished levels of job {job_id} are kept in {service.settings.database})" if measured else ""
+def _measured(results: Sequence[LevelResult]) -> int:
+    return sum(result.status is not LevelStatus.FAILED for result in results)
+
+
+def _kept(results: Sequence[LevelResult], job_id: str, settings: Settings) -> str:
+    measured = _measured(results)
+    return f" ({measured} finished levels of job {job_id} are kept in {settings.database})" if measured else ""
+
+
+def _by_hand(engine: EngineInfo, reason: str) -> str:
+    """What to put back by hand: this process ends, and with it the memory of the values."""
+    values = ", ".join(f"{name} = {value}" for name, value in engine.found)
+    return f"the engine's values could not be put back: {reason}; set by hand what it had: {values}"
 
 
 async def _follow(service: Service, job_id: str, levels: int, show: Show) -> None:

@@ -36,11 +36,14 @@ _RULES = """
 ## What every command keeps to
 
 - `--json` prints one JSON document on standard output, and nothing else there. Progress and messages go to standard
-  error.
+  error. A command that fails prints one too: `{"error":}`, the line of standard error, and where `calibrate`, `run` or
+  `demo` know it, `"levels": [{"zoom":, "focus":, "reason":}]`, the levels that failed. Only a command line that cannot
+  be parsed at all leaves standard output empty.
 - Exit code 0: done. 1: the work failed, with the reason in one line. 2: wrong usage, which is what the command line
   alone tells; a file or an engine that is not there is work that failed.
 - A file is written whole or not at all. `--out` is checked before the work begins.
-- Ctrl-C ends the work, keeps what is finished and gives the engine its values back.
+- Ctrl-C ends the work, keeps what is finished and gives the engine its values back; `run` and `demo` say which job in
+  which database keeps how many levels. Values that could not be put back are named in a warning, to be set by hand.
 - `lensmatch --verbose COMMAND` shows the log on standard error; `lensmatch --install-completion` completes commands
   and options in your shell.
 
@@ -58,7 +61,7 @@ _DOCUMENTS = {
     '"covariance": [[[uu, uv], [uv, vv]], ...], "centre": [u, v], "blur_px":, '
     '"quality": {"score":, "contrast":, "fit_chi2":, "grid_rms_px":}, "seconds":}`, points row by row, `point_ids` '
     "which of the target's points each one is (a board may be partly hidden), `null` what is not told; or "
-    '`{"found": false, "reason":}` with exit code 1',
+    '`{"found": false, "reason":, "error":}` with exit code 1',
     "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "

@@ -22,7 +22,7 @@ from app.cli.console import (
 )
 from app.cli.jobs import FinishedJob, run_job
 from app.cli.operator import TerminalOperator, has_terminal
-from app.cli.tables import show_table
+from app.cli.tables import show_table, tell_failed
 from app.documents import read_job
 from app.engines import Engines
 from app.report import LevelReport, RunReport, write_report
@@ -46,8 +46,8 @@ def run(
     Each level is stored as it ends, in the same database as the service's. With an operator's head you are asked for
     each movement. Ctrl-C ends the job, keeps the finished levels and gives the engine its values back.
     """
-    settings = build_settings(database=database)
-    with reported_errors():
+    with reported_errors(as_json):
+        settings = build_settings(database=database)
         check_out(out, report)
         request = read_job(job)
         profile, source = studio_profile(studio, settings)
@@ -66,6 +66,7 @@ def run(
         if report is not None:
             write_report(report, job_report(finished))
         if as_json:
+            tell_failed(finished.table.levels)
             print_json(table_to_document(finished.table))
         else:
             show_table(finished.table)

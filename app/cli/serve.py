@@ -71,10 +71,11 @@ def serve(
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     for chatty in ("httpx", "httpcore", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
-    settings = build_settings(host=host, port=port, database=database, profiles=tuple(profile) if profile else None)
-    if allow_host:
-        settings = build_settings(**settings.model_dump() | {"allowed_hosts": (*settings.allowed_hosts, *allow_host)})
-    with reported_errors():
+    with reported_errors(as_json):
+        settings = build_settings(host=host, port=port, database=database, profiles=tuple(profile) if profile else None)
+        if allow_host:
+            hosts = (*settings.allowed_hosts, *allow_host)
+            settings = build_settings(**settings.model_dump() | {"allowed_hosts": hosts})
         asyncio.run(_serve(settings, as_json))
 
 

@@ -53,13 +53,14 @@ def simulate(
 
     Prints one line of JSON with its addresses when it is ready, then runs until Ctrl-C.
     """
-    if lens_file is None and lens not in embedded_lens_names():
-        wrong_usage(f"no embedded lens is called {lens!r}; there are: {', '.join(embedded_lens_names())}")
-    for spec in fault or ():
-        try:
-            parse_fault(spec)
-        except SimulatorError as error:
-            wrong_usage(str(error))
+    with reported_errors(as_json):
+        if lens_file is None and lens not in embedded_lens_names():
+            wrong_usage(f"no embedded lens is called {lens!r}; there are: {', '.join(embedded_lens_names())}")
+        for spec in fault or ():
+            try:
+                parse_fault(spec)
+            except SimulatorError as error:
+                wrong_usage(str(error))
     options = SimulatorOptions(
         lens_file=lens_file,
         lens=lens,
@@ -76,5 +77,5 @@ def simulate(
         faults=tuple(fault or ()),
         exit_with_parent=exit_with_parent,
     )
-    with reported_errors():
+    with reported_errors(as_json):
         raise typer.Exit(main(options))

@@ -61,8 +61,8 @@ def study_levels(zooms: int = STUDY_ZOOMS, focuses: int = STUDY_FOCUSES) -> list
     return levels[:-1] if (zooms, focuses) == (STUDY_ZOOMS, STUDY_FOCUSES) else levels
 
 
-def studio_profile(addresses: dict[str, Any], image_size: Sequence[int]) -> StudioProfile:
-    """The profile that speaks to a simulated studio at these addresses."""
+def studio_profile(addresses: dict[str, Any], lens: ZoomLens) -> StudioProfile:
+    """The profile that speaks to a simulated studio with this lens at these addresses."""
     base = StudioProfile()
     return base.model_copy(
         update={
@@ -71,7 +71,9 @@ def studio_profile(addresses: dict[str, Any], image_size: Sequence[int]) -> Stud
                 update={"url": addresses["mockboard"]["url"] + "/api/v1/MockCard/MockOutput/GetImage"}
             ),
             "head": base.head.model_copy(update={"kind": "simulated", "url": addresses["head"]["url"] + "/head"}),
-            "picture": base.picture.model_copy(update={"image_size": tuple(image_size)}),
+            "picture": base.picture.model_copy(
+                update={"image_size": lens.image_size, "pixel_aspect": lens.pixel_aspect}
+            ),
         }
     )
 

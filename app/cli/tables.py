@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -46,6 +48,13 @@ def show_table(table: LensTable) -> None:
         _tell_reasons(level)
 
 
+def tell_failed(levels: Iterable[LevelResult]) -> None:
+    """Each failed level with its reason, one line each on standard error."""
+    for level in levels:
+        if level.status is LevelStatus.FAILED:
+            _tell_reason(level)
+
+
 def _add_level(grid: Table, level: LevelResult) -> None:
     colour = _COLOURS[level.status]
     place = (f"{level.zoom:.3f}", f"{level.focus:.2f}", f"[{colour}]{level.status.value}[/]")
@@ -80,13 +89,20 @@ def _add_level(grid: Table, level: LevelResult) -> None:
     grid.add_row("", "", "", *told, style="dim")
 
 
-def _tell_reasons(level: LevelResult) -> None:
-    where = f"zoom {level.zoom:.3f}, focus {level.focus:.2f}"
+def _tell_reason(level: LevelResult) -> None:
     if level.reason:
         colour = _COLOURS[level.status]
-        messages.print(f"[{colour}]{where} {level.status.value}:[/] {escape(level.reason)}")
+        messages.print(f"[{colour}]{_where(level)} {level.status.value}:[/] {escape(level.reason)}")
+
+
+def _where(level: LevelResult) -> str:
+    return f"zoom {level.zoom:.3f}, focus {level.focus:.2f}"
+
+
+def _tell_reasons(level: LevelResult) -> None:
+    _tell_reason(level)
     for left in level.left_out:
-        messages.print(f"[dim]{where}: left out {escape(left.picture)}: {escape(left.reason)}[/]")
+        messages.print(f"[dim]{_where(level)}: left out {escape(left.picture)}: {escape(left.reason)}[/]")
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -10,8 +10,10 @@ from datetime import datetime
 from functools import partial
 from typing import Any
 
-from app.documents import JobRequest
-from app.engines import EngineError, EngineInfo, Engines, Lease
+from pydantic import ValidationError
+
+from app.documents import JobRequest, one_line
+from app.engines import EngineError, EngineInfo, Engines, Lease, PictureFacts
 from app.errors import QueueFull
 from app.events import (
     AnyEvent,
@@ -84,6 +86,10 @@ class _Background:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
             self._task = None
+
+
+def _pictures_of(request: JobRequest) -> PictureFacts:
+    return PictureFacts(request.image_size, request.pixel_aspect)
 
 
 def make_method(request: JobRequest, task: LevelTask) -> LevelMethod:
@@ -168,8 +174,8 @@ class JobRunner:
         return self._engines.infos()
 
     async def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobRecord:
-        """Store a job and queue it. Raises UnknownEngine, QueueFull, IdempotencyConflict."""
-        self._engines.require(request.engine)
+        """Store a job and queue it. Raises UnknownEngine, StudioMismatch, QueueFull, IdempotencyConflict."""
+        self._engines.require_pictures(request.engine, _pictures_of(request))
         worker = self._workers[request.engine]
         if sum(w.queue.qsize() for w in self._workers.values()) >= self._queue_limit:
             raise QueueFull(self._queue_limit, self._retry_after_s)
@@ -227,7 +233,14 @@ class JobRunner:
             record = await self._repository.get_job(job_id)
             if record.state is not JobState.QUEUED:
                 return  # cancelled while it waited
-            request = JobRequest.model_validate(dict(record.request))
+            try:
+                request = JobRequest.model_validate(dict(record.request))
+            except ValidationError as error:
+                # Queued under rules that another version has made stricter.
+                await self._fail(job_id, f"the stored job is refused: {one_line(error)}; correct it and send it again")
+                return
+            # Asked again: it may have waited through a restart, and the profile may have been changed meanwhile.
+            self._engines.require_pictures(request.engine, _pictures_of(request))
             await self._change(
                 job_id, JobState.RUNNING, None, JobStarted(engine=request.engine, levels=len(request.levels))
             )
@@ -347,10 +360,12 @@ class JobRunner:
             log.exception("the pictures of level %d of job %s could not be stored", ordinal, job_id)
 
     async def _finish(self, job_id: str, request: JobRequest, results: list[LevelResult]) -> None:
-        if all(result.status is LevelStatus.FAILED for result in results):
+        failed = [result for result in results if result.status is LevelStatus.FAILED]
+        if len(failed) == len(results):
             reasons = sorted({result.reason or "" for result in results})
             await self._fail(job_id, f"no level could be measured: {reasons[0]}")
             return
+        reason = f"{len(failed)} of {len(results)} levels failed: {failed[0].reason}" if failed else None
         table = LensTable(
             lens=request.lens,
             camera=request.camera,
@@ -366,7 +381,7 @@ class JobRunner:
         await self._change(
             job_id,
             JobState.DONE,
-            None,
+            reason,
             JobDone(table_id=summary.id),
         )
 

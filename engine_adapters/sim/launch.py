@@ -15,6 +15,12 @@ READY_BOUND_S = 60.0
 """Longest wait for the first line: a cold start imports OpenCV and draws one picture on a loaded machine."""
 
 _END_BOUND_S = 10.0
+# Ctrl-C at a terminal reaches its whole process group: the studio must outlive the client that puts its values back.
+_OWN_GROUP: dict[str, Any] = (
+    {"creationflags": 0x200}  # CREATE_NEW_PROCESS_GROUP, a name that Python has on Windows only
+    if sys.platform == "win32"
+    else {"start_new_session": True}
+)
 _LINE_LIMIT = 1 << 20
 
 
@@ -33,6 +39,7 @@ async def launched_studio(options: Sequence[str] = ()) -> AsyncIterator[dict[str
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
         limit=_LINE_LIMIT,
+        **_OWN_GROUP,
     )
     if process.stdin is None or process.stdout is None or process.stderr is None:
         raise RuntimeError("a process started with pipes has them")

@@ -134,10 +134,43 @@ def picture_set(folder: Path, **changes: Any) -> dict[str, Any]:
 def test_a_set_without_a_usable_picture_fails_with_the_reasons(tmp_path: Path) -> None:
     picture_set(tmp_path)
     out = tmp_path / "table.json"
-    told = reason(invoke("calibrate", tmp_path, "--out", out, "--json"))
+    told = reason(invoke("calibrate", tmp_path, "--out", out))
     assert "no level could be measured" in told
-    assert "empty.png" in told
     assert not out.exists()
+    for why in (
+        "empty.png: the picture is empty",
+        "cut.png: picture = '28 bytes': not a PNG",
+        "garbage.png: not a PNG",
+    ):
+        assert told.count(why) == 1, told
+    assert "empty.png: empty.png" not in told
+
+
+def test_what_fails_is_one_json_document_too(tmp_path: Path) -> None:
+    picture_set(tmp_path)
+    for words, levels in (
+        (["calibrate", tmp_path], 1),
+        (["calibrate", tmp_path / "none"], 0),
+        (["import", tmp_path / "none.csv", "--format", "csv"], 0),
+        (["import", tmp_path / "none.csv", "--format", "xyz"], 0),
+        (["export", tmp_path / "none.json", "--format", "csv", "--out", tmp_path / "out.csv"], 0),
+        (["detect", tmp_path / "none.png", "--target", "triangle"], 0),
+        (["detect", tmp_path / "garbage.png", "--target", "light"], 0),
+        (["doctor", "--studio", tmp_path / "none.toml"], 0),
+        (["doctor", "--print-profile"], 0),
+        (["run", tmp_path / "none.json"], 0),
+        (["serve", "--profile", tmp_path / "none.toml", "--database", tmp_path / "x.db"], 0),
+        (["demo", "--lens", "none"], 0),
+        (["simulate", "--lens", "none"], 0),
+    ):
+        plain, document = invoke(*words), invoke(*words, "--json")
+        told = json.loads(document.stdout)
+        if words[0] != "doctor" or "--print-profile" not in words:
+            assert plain.stdout == ""
+            assert plain.exit_code == document.exit_code > 0
+            assert f"error: {told['error']}" in plain.stderr
+        assert len(told.get("levels", [])) == levels, words
+        assert all(level.keys() == {"zoom", "focus", "reason"} for level in told.get("levels", []))
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,16 @@ from typing import Any
 import httpx
 import pytest
 from typer.testing import CliRunner
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
 
+from app.api.sockets import RESTARTING
 from app.cli.commands import cli
+from tests.support.service import JOB, assert_problem
 
 BOUND_S = 60.0
+STOP_BOUND_S = 15.0
+# Longest stop of a service without a job: its grace for open connections, and the store.
 pytestmark = pytest.mark.timeout(120)
 posix_signals = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends Ctrl-C to whole consoles only")
 
@@ -45,8 +51,17 @@ async def test_it_listens_where_it_says_and_stops_on_sigterm_with_an_open_socket
             assert (await client.get("/api/v1/readyz")).status_code == 200
             engines = (await client.get("/api/v1/engines")).json()["engines"]
             assert [engine["name"] for engine in engines] == ["default"]
-        process.send_signal(signal.SIGTERM)
-        out, err = await asyncio.wait_for(process.communicate(), BOUND_S)
+            refused = await client.post("/api/v1/jobs", json=JOB | {"pixel_aspect": 1.0008})
+            assert_problem(refused, "studio-mismatch")
+            assert "the studio profile's 1 ([picture] pixel_aspect)" in refused.json()["detail"]
+            address = told["url"].replace("http://", "ws://") + "/api/v1/events"
+            async with connect(address, proxy=None) as events:
+                await (await events.ping())
+                process.send_signal(signal.SIGTERM)
+                with pytest.raises(ConnectionClosed):
+                    await asyncio.wait_for(events.recv(), STOP_BOUND_S)
+                assert events.close_code == RESTARTING == 1012
+                out, err = await asyncio.wait_for(process.communicate(), STOP_BOUND_S)
     assert process.returncode == 0, err.decode()
     assert out == b""
     assert b"Traceback" not in err

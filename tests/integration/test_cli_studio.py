@@ -50,7 +50,7 @@ async def studio(folder: Path, *options: str) -> AsyncIterator[dict[str, Any]]:
 
 
 def write_profile(folder: Path, addresses: dict[str, Any]) -> None:
-    text = profile_toml(studio_profile(addresses, LENS.image_size))
+    text = profile_toml(studio_profile(addresses, LENS))
     (folder / "studio.toml").write_text(text, "utf-8")
 
 
@@ -102,7 +102,7 @@ def no_engine() -> dict[str, Any]:
 @pytest.mark.slow
 async def test_doctor_and_run_on_a_studio_that_is_in_order(lensmatch: Any, folder: Path) -> None:
     async with studio(folder) as addresses:
-        engine = R3Engine.from_profile(studio_profile(addresses, LENS.image_size))
+        engine = R3Engine.from_profile(studio_profile(addresses, LENS))
         before = await engine.read_state()
         words = ("doctor", "--studio", "studio.toml", "--measure-delay", "--json")
         told = json.loads((await asyncio.to_thread(invoke, *words)).stdout)
@@ -112,8 +112,8 @@ async def test_doctor_and_run_on_a_studio_that_is_in_order(lensmatch: Any, folde
         assert all(check["detail"] for check in told["checks"])
 
         write_job(folder, addresses, engine="studio 1")
-        words = ("run", "job.json", "--studio", "studio.toml", "--out", "table.json", "--report", "report.html")
-        done = await lensmatch(*words, "--json")
+        files = ("--out", "table.json", "--report", "report.html")
+        done = await lensmatch("run", "job.json", "--studio", "studio.toml", *files, "--json")
         assert done.returncode == 0, done.stderr
         document = json.loads(done.stdout)
         assert document == json.loads((folder / "table.json").read_text("utf-8"))
@@ -141,6 +141,10 @@ async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(lensmatc
         (line,) = [line for line in err.decode().splitlines() if line.startswith("error: ")]
         assert "finished levels of job" in line
         assert not (folder / "table.json").exists()
+        (warning,) = [line for line in err.decode().splitlines() if line.startswith("warning: ")]
+        assert "the engine's values could not be put back" in warning
+        assert "set by hand what it had: " in warning
+        assert " = " in warning
     assert await stored(folder) == (JobState.FAILED, True)
 
 
@@ -149,7 +153,7 @@ async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(lensmatc
 async def test_ctrl_c_cancels_the_job_and_restores_the_engine(lensmatch: Any) -> None:
     folder = lensmatch.folder
     async with studio(folder) as addresses:
-        engine = R3Engine.from_profile(studio_profile(addresses, LENS.image_size))
+        engine = R3Engine.from_profile(studio_profile(addresses, LENS))
         before = await engine.read_state()
         write_job(folder, addresses, LEVELS)
         async with lensmatch.started("run", "job.json", "--studio", "studio.toml") as process:
@@ -158,7 +162,10 @@ async def test_ctrl_c_cancels_the_job_and_restores_the_engine(lensmatch: Any) ->
             out, err = await asyncio.wait_for(process.communicate(), BOUND_S)
         assert process.returncode == 1
         assert out == b""
-        assert "error: interrupted; what was finished is kept" in err.decode()
+        (line,) = [line for line in err.decode().splitlines() if line.startswith("error: ")]
+        assert line.startswith("error: interrupted; what was finished is kept: job ")
+        assert f" in {folder / 'lensmatch.db'}, " in line
+        assert re.search(r", [1-4] of 5 levels; the engine has its values back$", line)
         assert "Traceback" not in err.decode()
         assert await engine.read_state() == before
         await engine.close()
@@ -182,15 +189,62 @@ async def stored(folder: Path) -> tuple[JobState, bool]:
         return job.state, bool(await repository.list_levels(job.id))
 
 
-async def test_a_target_behind_the_camera_fails_with_its_reason(folder: Path) -> None:
+def test_a_target_behind_the_camera_fails_with_its_reason(folder: Path) -> None:
+    targets = no_engine()["survey"]["targets"]
+    targets["board"]["pose"]["centre_m"] = [0.0, -5.0, 1.6]
+    line = reason(invoke("run", write_job(folder, no_engine(), targets=targets)))
+    assert "targets.board turns its back to the camera" in line
+
+
+async def test_a_job_without_a_measured_level_fails_with_its_reason(folder: Path) -> None:
     async with studio(folder) as addresses:
-        targets = no_engine()["survey"]["targets"]
-        targets["board"]["pose"]["centre_m"] = [0.0, -5.0, 1.6]
-        write_job(folder, addresses, targets=targets)
-        words = ("run", "job.json", "--studio", "studio.toml", "--out", "table.json")
-        line = reason(await asyncio.to_thread(invoke, *words))
-        assert "no level could be measured" in line
-        assert not (folder / "table.json").exists()
+        targets = {"board_large": addresses["survey"]["targets"]["board_large"]}
+        write_job(folder, addresses, [(1.0, 0.25)], targets=targets)
+        words = ("run", "job.json", "--studio", "studio.toml", "--out", "table.json", "--json")
+        done = await asyncio.to_thread(invoke, *words)
+    assert done.exit_code == 1
+    told = json.loads(done.stdout)
+    (level,) = told["levels"]
+    assert (level["zoom"], level["focus"]) == (1.0, 0.25)
+    assert told["error"] == f"the job failed: no level could be measured: {level['reason']}"
+    assert told["error"].count("no target was found") == 1
+    assert [line for line in done.stderr.splitlines() if line.startswith("error: ")] == [f"error: {told['error']}"]
+    assert not (folder / "table.json").exists()
+
+
+async def test_a_level_that_fails_is_told_and_kept_as_the_jobs_reason(folder: Path) -> None:
+    async with studio(folder) as addresses:
+        # At the tele end the large board does not fit the picture, and it is the only one surveyed.
+        targets = addresses["survey"]["targets"]
+        write_job(folder, addresses, [(0.0, 0.25), (1.0, 0.25)], targets={"board_large": targets["board_large"]})
+        done = await asyncio.to_thread(invoke, "run", "job.json", "--studio", "studio.toml", "--json")
+    assert done.exit_code == 0, done.stderr
+    assert [level["status"] for level in json.loads(done.stdout)["levels"]] == ["ok", "failed"]
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("zoom 1.000, focus 0.25 failed: ")]
+    async with await Repository.open(folder / "lensmatch.db", lambda: datetime.now(UTC)) as repository:
+        (job,) = (await repository.list_jobs()).jobs
+    assert job.state is JobState.DONE
+    assert job.reason == f"1 of 2 levels failed: {line.partition(' failed: ')[2]}"
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            {"pixel_aspect": 1.0008},
+            "the job's pixel_aspect 1.0008 is not the studio profile's 1 ([picture] pixel_aspect)",
+        ),
+        ({"image_size": [1280, 720]}, "the job's image_size 1280x720 is not the studio profile's 1920x1080"),
+    ],
+)
+def test_a_job_that_disagrees_with_the_profile_is_not_begun(change: dict[str, Any], told: str, folder: Path) -> None:
+    write_profile(folder, no_engine())
+    write_job(folder, no_engine(), **change)
+    words = ("run", "job.json", "--studio", "studio.toml")
+    line = reason(invoke(*words))
+    assert told in line
+    assert line.endswith("correct one of them")
+    assert line == f"error: {json.loads(invoke(*words, '--json').stdout)['error']}"
 
 
 def test_an_engine_that_is_not_there(folder: Path) -> None:

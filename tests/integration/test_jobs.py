@@ -14,9 +14,9 @@ import pytest
 from app.bootstrap import Service, running_service
 from app.cli.simulated import studio_engines, studio_job, studio_profile, true_lens
 from app.documents import JobRequest
-from app.engines import UnknownEngine
+from app.engines import StudioMismatch, UnknownEngine
 from app.errors import QueueFull
-from app.events import TERMINAL_KINDS
+from app.events import TERMINAL_KINDS, JobQueued, draft
 from app.settings import Settings
 from calibration.compare import overlay
 from calibration.tables import LevelStatus
@@ -34,6 +34,10 @@ SMALL_TRUTH = FULL | {
 }
 LENS = parse_lens(SMALL_TRUTH)
 FAST = ("--picture-time-ms", "4", "--head-speed", "2000", "--payload-format", "jpeg")
+SURVEY = {
+    "targets": {"board": {"kind": "chessboard", "squares": [8, 8], "square_m": 0.1, "pose": {"centre_m": [0, 5, 1.6]}}},
+    "pivot_m": [0.0, 0.0, 1.6],
+}
 BOUND_S = 60.0
 ENOUGH_TIME_S = 90
 
@@ -67,7 +71,7 @@ class Bench:
         return await self.until(job_id, *TERMINAL_KINDS)
 
     async def engine_values(self) -> tuple[tuple[str, str], ...]:
-        engine = R3Engine.from_profile(studio_profile(self.addresses, LENS.image_size))
+        engine = R3Engine.from_profile(studio_profile(self.addresses, LENS))
         try:
             return (await engine.read_state()).exports
         finally:
@@ -83,7 +87,7 @@ def fast_studio(folder: Path, *options: str) -> contextlib.AbstractAsyncContextM
 @contextlib.asynccontextmanager
 async def bench(database: Path, *options: str, queue_limit: int = 100) -> AsyncIterator[Bench]:
     async with fast_studio(database.parent, *options) as addresses:
-        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        engines = studio_engines(studio_profile(addresses, LENS))
         settings = Settings(database=database, queue_limit=queue_limit)
         async with running_service(settings, engines) as service:
             yield Bench(service, addresses)
@@ -157,10 +161,11 @@ async def test_a_level_that_fails_is_kept_with_its_reason_and_the_rest_goes_on(t
         assert wide.status is LevelStatus.OK
         assert tele.status is LevelStatus.FAILED
         assert "no target was found" in (tele.reason or "")
+        assert (await b.service.repository.get_job(record.id)).reason == f"1 of 2 levels failed: {tele.reason}"
 
 
 @pytest.mark.timeout(ENOUGH_TIME_S)
-async def test_a_target_behind_the_camera_is_one_clear_reason(tmp_path: Path) -> None:
+async def test_a_stored_job_with_a_target_behind_the_camera_is_one_clear_reason(tmp_path: Path) -> None:
     async with bench(tmp_path / "jobs.db") as b:
         job = b.job((0.5, 0.25))
         board = job.targets["board_large"]
@@ -169,7 +174,7 @@ async def test_a_target_behind_the_camera_is_one_clear_reason(tmp_path: Path) ->
         record = await b.service.runner.submit(job.model_copy(update={"targets": {"board_large": behind}}))
         ended = await b.ended(record.id)
         assert ended.kind == "job_failed"
-        assert "no level could be measured" in ended.data["reason"]
+        assert "the stored job is refused: targets.board_large turns its back to the camera" in ended.data["reason"]
 
 
 @pytest.mark.timeout(ENOUGH_TIME_S)
@@ -202,7 +207,7 @@ async def test_no_delay_of_the_output_leads_to_a_stale_picture(tmp_path: Path, f
 async def test_an_engine_that_is_not_there_fails_the_job_with_its_address(tmp_path: Path) -> None:
     async with bench(tmp_path / "jobs.db") as b:
         addresses = {**b.addresses, "r3": {"host": "127.0.0.1", "port": 1}}
-        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        engines = studio_engines(studio_profile(addresses, LENS))
         async with running_service(Settings(database=tmp_path / "other.db"), engines) as service:
             other = Bench(service, b.addresses)
             record = await service.runner.submit(other.job())
@@ -214,11 +219,37 @@ async def test_an_engine_that_is_not_there_fails_the_job_with_its_address(tmp_pa
 
 
 @pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_job_that_disagrees_with_the_profile_is_refused_and_fails_if_it_waited(tmp_path: Path) -> None:
+    addresses = {
+        "r3": {"host": "127.0.0.1", "port": 1},
+        "mockboard": {"url": "http://127.0.0.1:1"},
+        "head": {"url": "http://127.0.0.1:1"},
+        "survey": SURVEY,
+    }
+    changed = parse_lens(SMALL_TRUTH | {"pixel_aspect": 1.0008})
+    settings = Settings(database=tmp_path / "jobs.db")
+    async with running_service(settings, studio_engines(studio_profile(addresses, LENS))) as service:
+        b = Bench(service, addresses)
+        with pytest.raises(StudioMismatch, match=r"pixel_aspect 1.0008 is not .* 1 \(\[picture\] pixel_aspect\)"):
+            await service.runner.submit(b.job(pixel_aspect=1.0008))
+        with pytest.raises(StudioMismatch, match=r"image_size 960x544 is not .* 960x540 \(\[picture\] image_size\)"):
+            await service.runner.submit(b.job(image_size=(960, 544)))
+        assert not (await service.repository.list_jobs()).jobs
+        body = b.job().model_dump(mode="json")
+        queued = JobQueued(lens="L", camera="Cam0", engine="default", method="joint", levels=1)
+        waiting = await service.repository.create_job(body, "L", "default", None, draft(queued))
+    async with running_service(settings, studio_engines(studio_profile(addresses, changed))) as service:
+        ended = await Bench(service, addresses).ended(waiting.id)
+        assert ended.kind == "job_failed"
+        assert "the job's pixel_aspect 1 is not the studio profile's 1.0008" in ended.data["reason"]
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
 async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(tmp_path: Path) -> None:
     async with contextlib.AsyncExitStack() as stack:
         studio = await stack.enter_async_context(contextlib.AsyncExitStack())
         addresses = await studio.enter_async_context(fast_studio(tmp_path))
-        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        engines = studio_engines(studio_profile(addresses, LENS))
         service = await stack.enter_async_context(running_service(Settings(database=tmp_path / "jobs.db"), engines))
         b = Bench(service, addresses)
         record = await service.runner.submit(b.job((0.0, 0.25), (0.0, 0.75), (0.5, 0.25), (0.5, 0.75), (1.0, 0.25)))
@@ -236,7 +267,7 @@ async def test_an_engine_that_dies_in_mid_job_keeps_the_finished_levels(tmp_path
 @pytest.mark.timeout(ENOUGH_TIME_S)
 async def test_a_restart_takes_up_what_was_queued_and_ends_what_ran(tmp_path: Path) -> None:
     async with fast_studio(tmp_path) as addresses:
-        engines = studio_engines(studio_profile(addresses, LENS.image_size))
+        engines = studio_engines(studio_profile(addresses, LENS))
         settings = Settings(database=tmp_path / "jobs.db")
         async with running_service(settings, engines) as service:
             b = Bench(service, addresses)

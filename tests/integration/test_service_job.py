@@ -75,7 +75,7 @@ async def service(lensmatch: Any) -> AsyncIterator[Client]:
 async def studio(folder: Path) -> AsyncIterator[tuple[dict[str, Any], R3Engine]]:
     """A simulated studio with its profile in ``studio.toml``, and an adapter that looks at its engine."""
     async with launched_studio(FAST) as addresses:
-        profile = studio_profile(addresses, LENS.image_size)
+        profile = studio_profile(addresses, LENS)
         (folder / "studio.toml").write_text(profile_toml(profile), "utf-8")
         engine = R3Engine.from_profile(profile)
         try:

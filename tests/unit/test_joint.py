@@ -147,7 +147,7 @@ def test_a_light_is_never_looked_for_and_alone_is_refused() -> None:
 def test_a_strong_bend_does_not_fold_the_first_pictures(truth: Lens, seed: int) -> None:
     """One picture in the middle hardly tells k1 and k2: a fold that comes of it must not end the level."""
     level = task()
-    result, captures = drive(JointMethod(level), truth, level, seed=seed, sigma_px=0.2 if seed == 3 else 0.02)
+    result, _ = drive(JointMethod(level), truth, level, seed=seed, sigma_px=0.2 if seed == 3 else 0.02)
     assert result.status is not LevelStatus.FAILED
     assert not any("folds" in out.reason for out in result.left_out)
     assert overlay(truth, result.lens(SIZE)).max_px < (2.0 if seed == 3 else 0.15)
