@@ -23,7 +23,7 @@ from storage.exports.base import MAX_DOCUMENT_BYTES, Export, decode_text
 from storage.schemas import document_to_table, table_to_document
 
 _TRIGGERS = ("=", "+", "-", "@", "\t", "\r", "'")
-_TODO = "correct the cell, or export the table again"
+_ADVICE = "correct the cell, or export the table again"
 
 _TEXT, _INT, _FLOAT, _JSON = "text", "int", "float", "json"
 
@@ -103,12 +103,12 @@ def read_csv(data: bytes) -> LensTable:
     levels: list[dict[str, Any]] = []
     for number, row in rows:
         if len(row) != len(header):
-            raise BadDocument(f"row {number}", f"has {len(row)} cells, the header {len(header)}", _TODO)
+            raise BadDocument(f"row {number}", f"has {len(row)} cells, the header {len(header)}", _ADVICE)
         cells = dict(zip(header, row, strict=True))
         shared = _read_cells(cells, _TABLE_COLUMNS, number)
         if document and shared != document:
             differing = next(name for name in {**document, **shared} if shared.get(name) != document.get(name))
-            raise BadDocument(f"row {number}, {differing}", "differs from the first row", _TODO)
+            raise BadDocument(f"row {number}, {differing}", "differs from the first row", _ADVICE)
         document = shared
         levels.append(_read_cells(cells, _LEVEL_COLUMNS, number))
     if not levels:
@@ -154,7 +154,7 @@ def _read_cells(cells: Mapping[str, str], columns: Mapping[str, tuple[_Path, str
     for name, (path, _) in columns.items():
         partner = (*path[:-1], 1 - path[-1]) if isinstance(path[-1], int) else None
         if partner is not None and flat[path] is None and flat[partner] is not None:
-            raise BadDocument(f"row {number}, {name}", "is empty while the other half of the pair is not", _TODO)
+            raise BadDocument(f"row {number}, {name}", "is empty while the other half of the pair is not", _ADVICE)
     nested = _nested(list(flat.items())) or {}
     return {name: value for name, value in nested.items() if value is not None}
 
@@ -176,7 +176,7 @@ def _value(cell: str, kind: str, place: str) -> Any:
         try:
             return json.loads(cell) if cell else None
         except (ValueError, RecursionError) as error:
-            raise BadDocument(place, "is not JSON", _TODO) from error
+            raise BadDocument(place, "is not JSON", _ADVICE) from error
     if kind == _TEXT:
         text = cell[1:] if len(cell) > 1 and cell[0] == "'" and cell[1] in _TRIGGERS else cell
         return text or None
@@ -186,7 +186,7 @@ def _value(cell: str, kind: str, place: str) -> Any:
         return int(cell) if kind == _INT else float(cell)
     except ValueError as error:
         shown = cell if len(cell) <= 40 else f"{cell[:37]}..."
-        raise BadDocument(place, f"{shown!r} is no {'whole number' if kind == _INT else 'number'}", _TODO) from error
+        raise BadDocument(place, f"{shown!r} is no {'whole number' if kind == _INT else 'number'}", _ADVICE) from error
 
 
 CSV_TABLE = Export(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
-import importlib.util
 import itertools
 import json
 import subprocess
@@ -156,14 +155,11 @@ async def minimal_studio() -> AsyncIterator[Addresses]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def simulator() -> Iterator[Addresses | None]:
+def simulator() -> Iterator[Addresses]:
     """The simulated studio's addresses; its process ends with the session.
 
     Started before the first test, so that no test seems to leave a process behind.
     """
-    if importlib.util.find_spec("engine_adapters.sim.__main__") is None:
-        yield None
-        return
     command = [
         sys.executable,
         "-m",
@@ -218,8 +214,6 @@ def _runner(
     async def run(check: Check) -> None:
         if request.param == "simulator":
             addresses = request.getfixturevalue("simulator")
-            if addresses is None:
-                pytest.skip("the simulated studio is not part of this checkout")
             await on_port(build(addresses.profile()), check)
             return
         async with minimal_studio() as addresses:
