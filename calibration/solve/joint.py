@@ -92,6 +92,7 @@ class JointMethod:
         self._again: dict[int, tuple[float, float, Role]] = {}
         self._checks: list[View] = []
         self._engine_residuals: list[FloatArray] = []
+        self._engine_sigma_px = 0.0
         self._check_failures: list[str] = []
         self._engine_reason = "the engine's render was not checked"
 
@@ -145,6 +146,7 @@ class JointMethod:
             self._task.focus,
             held_out=held_out_residuals(self._fit, self._views),
             engine_overlay_px=self._engine_overlay(),
+            engine_sigma_px=self._engine_sigma_px,
             engine_reason=self._engine_reason,
             left_out=self._left_out,
         )
@@ -305,6 +307,10 @@ class JointMethod:
         if self._fit is None or len(self._views) < 2:
             self._end("too few pictures show the target: " + "; ".join(out.reason for out in self._left_out[-3:]))
             return
+        if self._straight:
+            # Held at 0 the bend was good for aiming only: it must not be published as if it had been measured.
+            self._end(f"{len(self._views)} pictures do not tell the lens's bend: its fit folds or does not converge")
+            return
         usable = [v for v in self._views if v.name not in {name for name, _ in self._fit.dropped}]
         # The last picture's pose first: the head stands there already.
         self._checks = usable[::-1][: self._options.verify_views]
@@ -333,6 +339,7 @@ class JointMethod:
             self._engine_reason = f"the target was not found in the engine's render: {observation.result.reason}"
         else:
             self._engine_residuals.append(_matched(view.detection, observation.result))
+            self._engine_sigma_px = max(self._engine_sigma_px, _sigma_px(observation.result))
         if len(self._engine_residuals) + len(self._check_failures) >= len(self._checks):
             self._stage = _Stage.DONE
 
@@ -398,3 +405,8 @@ def _matched(real: Detection, virtual: Detection) -> FloatArray:
     """Virtual minus real corners (N, 2) px for the points found in both."""
     _, first, second = np.intersect1d(real.point_ids, virtual.point_ids, return_indices=True)
     return np.asarray(virtual.points_px[second] - real.points_px[first])
+
+
+def _sigma_px(detection: Detection) -> float:
+    """The least certain coordinate of a detection, one sigma."""
+    return float(np.sqrt(np.max(np.diagonal(detection.covariance_px2, axis1=1, axis2=2))))

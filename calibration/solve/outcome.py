@@ -61,10 +61,13 @@ def level_result(
     *,
     held_out: Mapping[str, FloatArray],
     engine_overlay_px: PixelError | None = None,
+    engine_sigma_px: float = 0.0,
     engine_reason: str = "no engine took part",
     left_out: Sequence[LeftOut] = (),
 ) -> LevelResult:
-    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it."""
+    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it.
+    ``engine_sigma_px``: how well the corners of the engine's render were found.
+    """
     expected = predicted_overlay(fit.lens, fit.covariance)
     every_left_out = (*left_out, *(LeftOut(name, why) for name, why in fit.dropped), *_outliers(fit))
     if why := _useless(fit, expected.max_px):
@@ -82,7 +85,7 @@ def level_result(
         reasons["held_out_px"] = "no picture could be spared from the fit"
     if engine_overlay_px is None:
         reasons["engine_overlay_px"] = engine_reason
-    trouble = _trouble(fit, expected.max_px, engine_overlay_px)
+    trouble = _trouble(fit, expected.max_px, engine_overlay_px, engine_sigma_px)
     sigma = fit.sigma
     return LevelResult.from_lens(
         zoom,
@@ -130,7 +133,7 @@ def _useless(fit: LevelFit, expected_max_px: float) -> str | None:
     return None
 
 
-def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -> list[str]:
+def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None, engine_sigma_px: float) -> list[str]:
     trouble: list[str] = []
     if not math.isfinite(expected_max_px) or expected_max_px > USABLE_OVERLAY_PX:
         advice = "take more pictures, the target nearer the corners"
@@ -155,7 +158,8 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None) -
                 f"the pictures hint at a nodal offset of {seen_mm:.0f} ± {sigma_mm:.0f} mm, not "
                 f"{fit.lens.nodal_offset_mm:g} mm; if so the field of view is off: add a target at another distance"
             )
-    if engine is not None and engine.max > max(ENGINE_AGREES_PX, 5 * expected_max_px, 6 * fit.rms_px):
+    agrees_px = max(ENGINE_AGREES_PX, 5 * expected_max_px, 6 * fit.rms_px, 5 * engine_sigma_px)
+    if engine is not None and engine.max > agrees_px:
         trouble.append(
             f"the engine's render is up to {engine.max:.1f} px off at these values: its lens model is not the "
             "profile's (check the radius unit of k1 and k2, the centre shift's sign and origin, the FoV's axis)"

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from calibration.compare import overlay
-from calibration.errors import InvalidInput, NotEnoughData
+from calibration.errors import FoldedLens, InvalidInput, NotEnoughData
 from calibration.lens import Lens
+from calibration.solve import joint
 from calibration.solve.joint import JointMethod
 from calibration.solve.search import Capture, LevelTask, Observation, Source
 from calibration.synthetic import observe
@@ -36,6 +37,7 @@ def drive(
     *,
     seed: int = 1,
     sigma_px: float = 0.02,
+    engine_sigma_px: float = 0.005,
     engine: Engine = lambda lens: lens,
     refuse: Callable[[Capture], str | None] = lambda capture: None,
 ) -> tuple[LevelResult, list[Capture]]:
@@ -62,7 +64,7 @@ def drive(
             result = observe(truth, pose, target, rng, sigma_px)
         else:
             assert told.lens is not None
-            result = observe(engine(told.lens), pose, target, rng, 0.005)
+            result = observe(engine(told.lens), pose, target, rng, engine_sigma_px)
         method.tell(Observation(told.step, result, pose, f"picture {told.step}"))
     return method.result(), captures
 
@@ -151,3 +153,29 @@ def test_a_strong_bend_does_not_fold_the_first_pictures(truth: Lens, seed: int) 
     assert result.status is not LevelStatus.FAILED
     assert not any("folds" in out.reason for out in result.left_out)
     assert overlay(truth, result.lens(SIZE)).max_px < (2.0 if seed == 3 else 0.15)
+
+
+def test_a_render_whose_corners_are_uncertain_is_no_disagreement() -> None:
+    """An engine without anti-aliasing draws corners to 0.3 px only, and the detector says so."""
+    truth = lens(40, -0.03, 0.005)
+    level = task()
+    result, _ = drive(JointMethod(level), truth, level, engine_sigma_px=0.3)
+    assert result.engine_overlay_px is not None
+    assert result.engine_overlay_px.max > 0.5
+    assert result.status is LevelStatus.OK
+
+
+def test_a_bend_held_for_aiming_is_never_published(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three pictures whose full fit folds, and no more to be had: the level fails, it does not say k1 = 0."""
+    solve = joint.solve_level
+
+    def folding(*arguments: object, straight: bool, **named: object) -> object:
+        if not straight:
+            raise FoldedLens(0.5, 0.6)
+        return solve(*arguments, straight=True, **named)  # type: ignore[arg-type]  # passed on as they came
+
+    monkeypatch.setattr(joint, "solve_level", folding)
+    truth = lens(40, -0.03, 0.005)
+    level = task()
+    with pytest.raises(NotEnoughData, match="do not tell the lens's bend"):
+        drive(JointMethod(level), truth, level, refuse=lambda c: "a person in front" if c.step > 2 else None)
