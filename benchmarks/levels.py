@@ -32,6 +32,11 @@ from engine_adapters.sim.lens_truth import ZoomLens, embedded_lens_names, load_e
 PICTURE_TIME_S = 0.015
 DELAY_FRAMES = 2
 METHODS = ("joint", "alternating")
+PLOTS = (
+    ("pictures", "pictures taken"),
+    ("overlay_max_px", "largest overlay error, px"),
+    ("seconds", "time, s"),
+)
 
 Progress = Callable[[float], None]
 Row = dict[str, object]

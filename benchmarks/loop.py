@@ -17,6 +17,7 @@ from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded
 
 _TICK_S = 0.005
 _IDLE_S = 2.0
+PLOTS = (("lag_p99_ms", "delay of the event loop, 99th percentile, ms"),)
 
 Progress = Callable[[float], None]
 

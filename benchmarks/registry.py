@@ -1,7 +1,7 @@
-"""The benchmarks by name, imported when one is run: each is a module with ``run`` and, if it has one, ``columns``.
+"""The benchmarks by name, imported when one is run.
 
-``run(*, quick, progress)`` gives rows, ``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs
-for the table that a person reads.
+Each is a module with ``run`` and, if it has them, ``columns`` and ``PLOTS``. ``run(*, quick, progress)`` gives rows, ``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs
+for the table that a person reads; ``PLOTS`` names the figures to be drawn, (column, title with its unit).
 """
 
 from __future__ import annotations
@@ -42,6 +42,12 @@ class Benchmark:
             return chosen
         names = dict.fromkeys(name for row in rows for name in row)
         return [(name, readable) for name in names]
+
+    @property
+    def plots(self) -> tuple[tuple[str, str], ...]:
+        """(column, title with its unit) of each figure to be drawn."""
+        chosen: tuple[tuple[str, str], ...] = getattr(importlib.import_module(self.module), "PLOTS", ())
+        return chosen
 
 
 BENCHMARKS = {

@@ -17,6 +17,7 @@ from engine_adapters.sim.studio import StudioSetup
 _TURNS = 40
 _QUICK_TURNS = 8
 _STEP_DEG = 0.013
+PLOTS = (("render_ms", "processor time for a picture, ms"),)
 
 Progress = Callable[[float], None]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ import typer
 
 from app.cli.console import check_out, print_json, progress_bar, reported_errors, say, write_file, wrong_usage
 from app.cli.tables import plain_table, print_table
+from app.report.bench import BenchSection, bench_page
 from benchmarks.registry import BENCHMARKS, Benchmark, Row, machine
 
 
@@ -20,6 +22,10 @@ def bench(
     ] = None,
     json_out: Annotated[
         str | None, typer.Option("--json", metavar="PATH", help="write the figures as JSON; - prints them")
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="PATH", dir_okay=False, help="write tables and plots as one HTML page"),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="a small share of the cases, to see that it runs")] = False,
 ) -> None:
@@ -31,12 +37,20 @@ def bench(
         chosen = [BENCHMARKS[name] for name in dict.fromkeys(names or BENCHMARKS)]
         out = Path(json_out) if json_out not in (None, "-") else None
         check_out(out)
+        check_out(report)
         documents = []
+        sections = []
         for benchmark in chosen:
             rows = _run(benchmark, quick)
             documents.append({"name": benchmark.name, "machine": machine(), "rows": _finite(rows)})
+            columns = benchmark.columns(rows)
+            sections.append(BenchSection(benchmark.name, benchmark.title, rows, columns, benchmark.plots))
             if json_out != "-":
                 _show(benchmark, rows)
+        if report is not None:
+            page = bench_page(sections, machine(), datetime.now(UTC))
+            write_file(report, page.encode())
+            say(f"report: {report}")
         document: Any = documents[0] if len(documents) == 1 else documents
         if json_out == "-":
             print_json(document)

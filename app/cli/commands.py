@@ -116,7 +116,11 @@ cli.command(
 )(simulate)
 cli.command(
     rich_help_panel=_CHECK,
-    epilog=_examples("lensmatch bench detect --quick", "lensmatch bench levels --json figures.json"),
+    epilog=_examples(
+        "lensmatch bench detect --quick",
+        "lensmatch bench levels --json figures.json",
+        "lensmatch bench --report bench.html",
+    ),
 )(bench)
 cli.command(
     rich_help_panel=_CHECK,

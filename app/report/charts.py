@@ -13,6 +13,7 @@ from app.report.svg import Svg, svg
 WIDTH, HEIGHT = 460.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 80.0, 14.0, 16.0, 46.0
 SHAPES = ("circle", "square", "triangle", "diamond")
+SERIES_COLOURS = 4
 _DASHES = ("", "7 4", "2 4", "9 3 2 3")
 _LABEL_STEP_X, _LABEL_STEP_Y = 70.0, 36.0
 
@@ -92,7 +93,7 @@ def legend_mark(style: int, hollow: bool, line: bool) -> Svg:
     """The sign of a series, for a legend in text."""
     path = svg('<path class="line s{}" d="M0 6H24"{}/>', _colour(style), _dash(style)) if line else ""
     return svg(
-        '<svg class="mark" viewBox="0 0 24 12" aria-hidden="true">{}{}</svg>', path, _marker(style, 12, 6, hollow)
+        '<svg class="mark" viewBox="0 0 24 12" aria-hidden="true">{}{}</svg>', path, marker(style, 12, 6, hollow)
     )
 
 
@@ -195,11 +196,11 @@ def _path(points: Sequence[tuple[float, float]], x: _Axis, y: _Axis, kind: str, 
 
 def _colour(style: int) -> int:
     # Sixteen series differ in colour or shape; the shape moves on each time the four colours have been round.
-    return style % 4
+    return style % SERIES_COLOURS
 
 
 def _dash(style: int) -> Svg:
-    pattern = _DASHES[(style + style // 4) % len(_DASHES)]
+    pattern = _DASHES[(style + style // SERIES_COLOURS) % len(_DASHES)]
     return svg(' stroke-dasharray="{}"', pattern) if pattern else Svg("")
 
 
@@ -221,11 +222,12 @@ def _series(series: Series, x: _Axis, y: _Axis) -> Iterator[Svg]:
                     ends[0],
                     ends[1],
                 )
-        yield _marker(series.style, at_x, at_y, series.hollow)
+        yield marker(series.style, at_x, at_y, series.hollow)
 
 
-def _marker(style: int, x: float, y: float, hollow: bool) -> Svg:
-    shape = SHAPES[(style + style // 4) % len(SHAPES)]
+def marker(style: int, x: float, y: float, hollow: bool) -> Svg:
+    """The mark of a series with its middle at (x, y)."""
+    shape = SHAPES[(style + style // SERIES_COLOURS) % len(SHAPES)]
     kind = f"dot s{_colour(style)}" + (" hollow" if hollow else "")
     if shape == "circle":
         return svg('<circle class="{}" cx="{:.1f}" cy="{:.1f}" r="4"/>', kind, x, y)

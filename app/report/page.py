@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from app.report.figures import charts
 from app.report.levels import Notes, evidence_row, lens_rows, level_view
@@ -29,28 +29,29 @@ def render_report(report: RunReport) -> str:
     levels = [level_view(level, report.table, level.key in opened) for level in report.levels]
     rows = [(view, lens_rows(level, report.table, notes)) for view, level in zip(levels, report.levels, strict=True)]
     evidence = [(view, evidence_row(level, notes)) for view, level in zip(levels, report.levels, strict=True)]
-    return (
-        _environment()
-        .get_template("report.html.j2")
-        .render(
-            title=report.title,
-            table=report.table,
-            created=f"{report.table.created:%Y-%m-%d %H:%M} UTC",
-            method=METHODS.get(report.table.method, report.table.method),
-            verdict=verdict(report),
-            tone=_tone(report),
-            facts=[*_table_facts(report.table), *report.facts],
-            charts=charts(report),
-            levels=levels,
-            lens_rows=rows,
-            evidence=evidence,
-            with_truth=any(level.truth is not None for level in report.levels),
-            truth_name=report.truth_name,
-            notes=notes.entries,
-            left_out=[(view, view.left_out) for view in levels if view.left_out],
-            version=product_version(),
-        )
+    return template("report.html.j2").render(
+        title=report.title,
+        table=report.table,
+        created=f"{report.table.created:%Y-%m-%d %H:%M} UTC",
+        method=METHODS.get(report.table.method, report.table.method),
+        verdict=verdict(report),
+        tone=_tone(report),
+        facts=[*_table_facts(report.table), *report.facts],
+        charts=charts(report),
+        levels=levels,
+        lens_rows=rows,
+        evidence=evidence,
+        with_truth=any(level.truth is not None for level in report.levels),
+        truth_name=report.truth_name,
+        notes=notes.entries,
+        left_out=[(view, view.left_out) for view in levels if view.left_out],
+        version=product_version(),
     )
+
+
+def template(name: str) -> Template:
+    """A template of this package; what is undefined in it is an error, every text is escaped."""
+    return _environment().get_template(name)
 
 
 def write_report(path: Path, report: RunReport) -> None:

@@ -69,3 +69,13 @@ def test_json_goes_to_a_file_for_several(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_each_registered_benchmark_is_there(name: str) -> None:
     assert callable(importlib.import_module(BENCHMARKS[name].module).run)
+
+
+def test_the_report_is_one_page_with_every_benchmark(tmp_path: Path) -> None:
+    out = tmp_path / "bench.html"
+    result = invoke("bench", "one", "two", "--report", out)
+    assert result.exit_code == 0, result.stderr
+    page = out.read_text("utf-8")
+    assert all(f'id="{name}"' in page for name in ("one", "two"))
+    assert page.count("theirs") == 2
+    assert "there is no folder" in invoke("bench", "--report", tmp_path / "no" / "b.html").stderr
