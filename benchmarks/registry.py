@@ -1,7 +1,8 @@
 """The benchmarks by name, imported when one is run.
 
-Each is a module with ``run`` and, if it has them, ``columns`` and ``PLOTS``. ``run(*, quick, progress)`` gives rows, ``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs
-for the table that a person reads; ``PLOTS`` names the figures to be drawn, (column, title with its unit).
+Each is a module with ``run`` and, if it has them, ``columns`` and ``PLOTS``. ``run(*, quick, progress)`` gives rows,
+``{"case":, "method":, figures...}``; ``columns()`` gives (name, format) pairs for the table that a person reads;
+``PLOTS`` names the figures to be drawn, (column, title with its unit).
 """
 
 from __future__ import annotations
