@@ -60,6 +60,9 @@ BENCHMARKS = {
         Benchmark("detect", "finding a chessboard, beside OpenCV's detectors", "benchmarks.detect"),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
         Benchmark(
+            "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"
+        ),
+        Benchmark(
             "render", "what a picture of the simulated studio costs, beside the time it imitates", "benchmarks.render"
         ),
     )
