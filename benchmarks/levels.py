@@ -7,6 +7,7 @@ is the method. Counts of pictures have no noise; seconds are this machine's. The
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import tempfile
 from collections.abc import Callable
@@ -23,6 +24,8 @@ from app.cli.simulated import (
     study_levels,
     true_lens,
 )
+from app.documents import JobRequest
+from app.engines import Engines
 from app.settings import Settings
 from calibration.compare import overlay, relative_errors
 from calibration.tables import LensTable
@@ -32,6 +35,7 @@ from engine_adapters.sim.lens_truth import ZoomLens, embedded_lens_names, load_e
 PICTURE_TIME_S = 0.015
 DELAY_FRAMES = 2
 METHODS = ("joint", "alternating")
+HARD_BLUR_PX, HARD_NOISE = 4.0, 5.0
 PLOTS = (
     ("pictures", "pictures taken"),
     ("overlay_max_px", "largest overlay error, px"),
@@ -43,7 +47,7 @@ Row = dict[str, object]
 
 
 def run(*, quick: bool = False, progress: Progress | None = None) -> list[Row]:
-    """Rows per level and method, a total for each method, and the ratio of the two."""
+    """Rows per level and method, a total for each, the ratio of the two, and the joint method on hard pictures."""
     return asyncio.run(_run(quick, progress or (lambda share: None)))
 
 
@@ -55,26 +59,49 @@ async def _run(quick: bool, progress: Progress) -> list[Row]:
     async with launched_studio(("--lens", lens.name, "--payload-format", "jpeg")) as addresses:
         engines = studio_engines(studio_profile(addresses, lens))
         for index, method in enumerate(METHODS):
-            with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
-                settings = Settings(database=Path(folder) / "bench.db")
-                request = studio_job(addresses, lens, levels, method)
-                before = await studio_use(addresses, PICTURE_TIME_S, DELAY_FRAMES)
 
-                def show(share: float, doing: str, index: int = index) -> None:
-                    # The alternating method takes by far the longest part.
-                    progress(0.05 * share if index == 0 else 0.05 + 0.9 * share)
+            def show(share: float, doing: str, index: int = index) -> None:
+                # The alternating method takes by far the longest part.
+                progress(0.05 * share if index == 0 else 0.05 + 0.85 * share)
 
-                job = await run_job(settings, engines, request, show)
-                use = (await studio_use(addresses, PICTURE_TIME_S, DELAY_FRAMES)).since(before)
-            of_method = _level_rows(method, job.table, lens)
+            before = await studio_use(addresses, PICTURE_TIME_S, DELAY_FRAMES)
+            table = await _table(engines, studio_job(addresses, lens, levels, method), show)
+            use = (await studio_use(addresses, PICTURE_TIME_S, DELAY_FRAMES)).since(before)
+            of_method = _level_rows(method, table, lens)
             rows += of_method
             totals[method] = _total(method, of_method, use)
-        progress(0.96)
     rows += [totals[method] for method in METHODS]
     rows.append(_ratio(totals["joint"], totals["alternating"]))
     rows.append(_study(totals["joint"], len(levels)))
+    rows += await _hard(lens, levels)
+    progress(0.96)
     rows.append(await _slow_way(lens, levels[0]))
     return rows
+
+
+async def _table(engines: Engines, request: JobRequest, show: Callable[[float, str], None]) -> LensTable:
+    """The lens table of a job on a fresh database."""
+    with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
+        job = await run_job(Settings(database=Path(folder) / "bench.db"), engines, request, show)
+    return job.table
+
+
+async def _hard(lens: ZoomLens, levels: list[tuple[float, float]]) -> list[Row]:
+    """The joint method's rows, and their total, on the same lens out of focus and with a noisy camera."""
+    truth = lens.truth()
+    for level in truth["levels"]:
+        level |= {"blur_px": HARD_BLUR_PX, "noise_sigma": HARD_NOISE}
+    with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
+        file = Path(folder) / "hard.json"
+        file.write_text(json.dumps(truth), encoding="utf-8")
+        async with launched_studio(("--lens-file", str(file), "--payload-format", "jpeg")) as addresses:
+            engines = studio_engines(studio_profile(addresses, lens))
+            before = await studio_use(addresses, PICTURE_TIME_S, DELAY_FRAMES)
+            table = await _table(engines, studio_job(addresses, lens, levels), lambda share, doing: None)
+            use = (await studio_use(addresses, PICTURE_TIME_S, DELAY_FRAMES)).since(before)
+    method = f"joint, blur {HARD_BLUR_PX:g} px, noise {HARD_NOISE:g}"
+    rows = _level_rows(method, table, lens)
+    return [*rows, _total(method, rows, use)]
 
 
 def _level_rows(method: str, table: LensTable, lens: ZoomLens) -> list[Row]:
@@ -150,13 +177,9 @@ def _study(joint: Row, levels: int) -> Row:
 async def _slow_way(lens: ZoomLens, level: tuple[float, float]) -> Row:
     """One level with pictures as the study first took them: snapshots on the engine's disk, 0.3 s each."""
     async with launched_studio(("--lens", lens.name, "--payload-format", "jpeg")) as addresses:
-        profile = studio_profile(addresses, lens)
-        with tempfile.TemporaryDirectory(prefix="lensmatch-bench-") as folder:
-            settings = Settings(database=Path(folder) / "bench.db")
-            engines = studio_engines(profile, slow_pictures=True)
-            request = studio_job(addresses, lens, [level])
-            job = await run_job(settings, engines, request, lambda share, doing: None)
-    rows = _level_rows("joint, snapshots on disk", job.table, lens)
+        engines = studio_engines(studio_profile(addresses, lens), slow_pictures=True)
+        table = await _table(engines, studio_job(addresses, lens, [level]), lambda share, doing: None)
+    rows = _level_rows("joint, snapshots on disk", table, lens)
     return rows[0]
 
 
