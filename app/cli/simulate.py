@@ -9,6 +9,7 @@ import typer
 
 from app.cli.console import reported_errors, wrong_usage
 from engine_adapters.sim.camera_output import PayloadStyle, PictureFormat
+from engine_adapters.sim.engine_camera import EngineCamera
 from engine_adapters.sim.errors import SimulatorError
 from engine_adapters.sim.faults import parse_fault
 from engine_adapters.sim.lens_truth import embedded_lens_names
@@ -34,6 +35,15 @@ def simulate(
             "4..6, or * for each",
         ),
     ] = None,
+    engine: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="how the engine reads its exports, repeatable: radius_unit, direction, center_shift, pixel_centres, "
+            "center_shift_sign_x, center_shift_sign_y, fov_axis, fov_unit, nodal_unit, nodal_sign as in the studio "
+            "profile; distortion_sign, overscan and pixel_aspect besides",
+        ),
+    ] = None,
     delay_frames: Annotated[
         int, typer.Option(min=0, max=120, help="frames from a change to the picture that shows it")
     ] = _DEFAULT.delay_frames,
@@ -56,6 +66,10 @@ def simulate(
     with reported_errors(as_json):
         if lens_file is None and lens not in embedded_lens_names():
             wrong_usage(f"no embedded lens is called {lens!r}; there are: {', '.join(embedded_lens_names())}")
+        try:
+            EngineCamera.parse(tuple(engine or ()))
+        except SimulatorError as error:
+            wrong_usage(str(error))
         for spec in fault or ():
             try:
                 parse_fault(spec)
@@ -75,6 +89,7 @@ def simulate(
         head_speed_deg_s=head_speed,
         seed=seed,
         faults=tuple(fault or ()),
+        engine=tuple(engine or ()),
         exit_with_parent=exit_with_parent,
     )
     with reported_errors(as_json):

@@ -30,6 +30,9 @@ def parse_options(arguments: list[str] | None = None) -> SimulatorOptions:
     parser.add_argument("--head-speed", type=float, default=default.head_speed_deg_s, help="degrees a second")
     parser.add_argument("--seed", type=int, default=default.seed, help="of the noise")
     parser.add_argument("--fault", action="append", default=[], metavar="SPEC", help="for example r3:late=0.5@3")
+    parser.add_argument(
+        "--engine", action="append", default=[], metavar="NAME=VALUE", help="radius_unit=half_width ..."
+    )
     parser.add_argument("--exit-with-parent", action="store_true", help="end when standard input closes")
     given = parser.parse_args(arguments)
     if given.seed < 0:
@@ -48,6 +51,7 @@ def parse_options(arguments: list[str] | None = None) -> SimulatorOptions:
         head_speed_deg_s=given.head_speed,
         seed=given.seed,
         faults=tuple(given.fault),
+        engine=tuple(given.engine),
         exit_with_parent=given.exit_with_parent,
     )
 

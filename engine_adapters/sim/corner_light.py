@@ -137,12 +137,11 @@ class CornerLight:
     ) -> tuple[LightArray, LightArray, LightArray]:
         """1/s_a, 1/s_b (per metre) and the correlation of the pixel's Gaussian in the panel's plane."""
         optics = self._optics
-        k1, k2 = np.float32(optics.k1), np.float32(optics.k2)
-        q = x * x + y * y
-        scale = 1 + q * (k1 + k2 * q)
-        bend = 2 * k1 + 4 * k2 * q
+        ratio, by_q = optics.bent(np.asarray(x * x + y * y, dtype=np.float64))
+        scale: LightArray = ratio.astype(np.float32)
+        bend: LightArray = (2 * by_q).astype(np.float32)
         xx, xy, yy = scale + bend * x * x, bend * x * y, scale + bend * y * y
-        unit = np.float32(self._sigma_px / optics.f_px) / (xx * yy - xy * xy)
+        unit: LightArray = np.asarray(self._sigma_px / optics.f_px / (xx * yy - xy * xy), dtype=np.float32)
         flat = np.float32(1.0 / optics.pixel_aspect)
         x_u, y_u, x_v, y_v = yy * unit, -xy * unit, -xy * unit * flat, xx * unit * flat
         n0, n1 = (np.float32(part) for part in self._normal[:2])

@@ -231,8 +231,8 @@ class EdgeLight:
         y = (origin_y + fixed * fixed_y + running * dy) * inverse_depth
         x_t, y_t = (dx - x * dz) * inverse_depth, (dy - y * dz) * inverse_depth
         q = x * x + y * y
-        scale = 1.0 + q * (optics.k1 + optics.k2 * q)
-        scale_t = (2.0 * optics.k1 + 4.0 * optics.k2 * q) * (x * x_t + y * y_t)
+        scale, bend = optics.bent(q)
+        scale_t = 2.0 * bend * (x * x_t + y * y_t)
         f_u, f_v = optics.f_px, optics.f_px * optics.pixel_aspect
         cu, cv = optics.center_px
         pixels = f_u * x * scale + cu, f_v * y * scale + cv

@@ -8,6 +8,7 @@ fitting code cannot hide behind the same error here.
 - Entrance pupil = pivot + nodal offset along forward.
 - Pinhole x = X/Z, y = Y/Z; radial Brown-Conrady, undistorted to distorted: s(q) = 1 + k1 q + k2 q^2, q = x^2 + y^2;
   u = f x s + (W-1)/2 + sx, v = a f y s + (H-1)/2 + sy.
+- An engine's polynomial may go the other way, x = x_d s(q_d): then s is read as that of the distorted radius.
 - Inverse: the radial ratio r/r_d is a smooth function of r_d^2. It is tabulated once for each lens (each node by
   Newton to 1e-13) and read by linear interpolation, exact to 1e-6 px.
 """
@@ -31,7 +32,8 @@ _BEYOND_PICTURE = 1.02
 
 @dataclass(frozen=True)
 class Optics:
-    """A lens on its sensor: focal length in px, k1 and k2 in focal-length units, centre shift in px."""
+    """A lens on its sensor: focal length in px, k1 and k2 in focal-length units, centre shift in px. ``reverse``: the
+    polynomial takes distorted radii to undistorted ones."""
 
     image_size: tuple[int, int]
     f_px: float
@@ -39,6 +41,7 @@ class Optics:
     k2: float = 0.0
     center_shift_px: tuple[float, float] = (0.0, 0.0)
     pixel_aspect: float = 1.0
+    reverse: bool = False
 
     @classmethod
     def from_fov(
@@ -62,7 +65,8 @@ class Optics:
 
     @cached_property
     def fold_radius(self) -> float:
-        """Undistorted radius at which the polynomial folds, 1 + 3 k1 q + 5 k2 q^2 = 0; infinity where it never does."""
+        """Radius at which the polynomial folds, 1 + 3 k1 q + 5 k2 q^2 = 0; infinity where it never does. It is that
+        which the polynomial takes: undistorted, or distorted where it is reverse."""
         discriminant = 9.0 * self.k1**2 - 20.0 * self.k2
         if discriminant < 0.0:
             return math.inf
@@ -79,13 +83,31 @@ class Optics:
         return math.hypot(far_u / self.f_px, far_v / (self.f_px * self.pixel_aspect))
 
     @cached_property
+    def fold_distorted(self) -> float:
+        """Distorted radius of the fold: beyond it the picture is empty; infinity where there is none."""
+        fold = self.fold_radius
+        if self.reverse or math.isinf(fold):
+            return fold
+        q = fold * fold
+        return fold * (1.0 + self.k1 * q + self.k2 * q * q)
+
+    @cached_property
     def folds_inside_picture(self) -> bool:
         """Whether two rays land on one pixel of the picture."""
-        fold = self.fold_radius
-        if math.isinf(fold):
-            return False
-        q = fold * fold
-        return fold * (1.0 + self.k1 * q + self.k2 * q * q) <= self.corner_radius
+        return self.fold_distorted <= self.corner_radius
+
+    def bent(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """r_d / r and its derivative by q = r^2, at undistorted q (any shape).
+
+        Reverse, with p(q_d) = 1 + k1 q_d + k2 q_d^2: r_d / r = 1 / p, and its derivative is
+        -(k1 + 2 k2 q_d) / (p^3 (1 + 3 k1 q_d + 5 k2 q_d^2)).
+        """
+        k1, k2 = self.k1, self.k2
+        if not self.reverse:
+            return 1.0 + q * (k1 + k2 * q), k1 + 2.0 * k2 * q
+        q_d = _distorted_radius(self, np.sqrt(q)) ** 2
+        p = 1.0 + q_d * (k1 + k2 * q_d)
+        return 1.0 / p, -(k1 + 2.0 * k2 * q_d) / (p**3 * (1.0 + q_d * (3.0 * k1 + 5.0 * k2 * q_d)))
 
 
 def undistorted_radius(optics: Optics, distorted: FloatArray) -> FloatArray:
@@ -122,11 +144,30 @@ def undistorted_radius(optics: Optics, distorted: FloatArray) -> FloatArray:
     return np.where(outside, np.nan, radius)
 
 
+def _distorted_radius(optics: Optics, undistorted: FloatArray) -> FloatArray:
+    """Distorted radius for each undistorted one where the polynomial is reverse: a few plain Newton steps, the
+    bracketed ones where they do not end. The same equation as :func:`undistorted_radius`, the radii exchanged."""
+    k1, k2 = optics.k1, optics.k2
+    radius = undistorted.copy()
+    for _ in range(8):
+        q = radius * radius
+        radius -= (radius * (1.0 + q * (k1 + k2 * q)) - undistorted) / (1.0 + q * (3.0 * k1 + 5.0 * k2 * q))
+    q = radius * radius
+    error = np.abs(radius * (1.0 + q * (k1 + k2 * q)) - undistorted)
+    inside = (radius >= 0.0) & (radius < optics.fold_radius)
+    if bool(np.all(inside & (error <= 1e-13 * (1.0 + undistorted)))):
+        return radius
+    solved = undistorted_radius(optics, undistorted)
+    return np.where(np.isnan(solved), min(optics.fold_radius, 1e6), solved)
+
+
 def _radial_ratio(optics: Optics, squared: FloatArray) -> FloatArray:
     """r / r_d at equally spaced r_d^2 from 0: some by the bracketed Newton, those between by one plain step more.
 
     Where that is not exact (near a fold) all are found by the bracketed one.
     """
+    if optics.reverse:
+        return 1.0 + squared * (optics.k1 + optics.k2 * squared)
     ratio = np.ones_like(squared)
     distorted = np.sqrt(squared[1:])
     chosen = squared[::_TABLE_STRIDE]
@@ -228,8 +269,9 @@ class View:
         limit = self.picture_radius
         inner = np.minimum(radius, limit)
         q = inner * inner
-        distorted = inner * (1.0 + optics.k1 * q + optics.k2 * q * q)
-        slope = 1.0 + 3.0 * optics.k1 * q + 5.0 * optics.k2 * q * q
+        ratio, bend = optics.bent(q)
+        distorted = inner * ratio
+        slope = ratio + 2.0 * q * bend
         distorted = distorted + np.maximum(slope, 0.05) * (radius - inner)
         scale = np.divide(distorted, radius, out=np.ones_like(radius), where=radius > 0.0)
         cu, cv = optics.center_px
@@ -247,5 +289,8 @@ class View:
     def picture_radius(self) -> float:
         """Undistorted radius that holds the whole picture (or all of it that a ray reaches), focal-length units."""
         optics = self.optics
+        if optics.reverse:
+            edge = min(optics.corner_radius * _BEYOND_PICTURE, optics.fold_radius)
+            return edge * (1.0 + optics.k1 * edge**2 + optics.k2 * edge**4)
         reach = undistorted_radius(optics, np.array([optics.corner_radius * _BEYOND_PICTURE]))[0]
         return float(optics.fold_radius if math.isnan(reach) else reach)

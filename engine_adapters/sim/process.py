@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from engine_adapters.sim.camera_output import CameraOutput, PayloadStyle, PictureFormat
+from engine_adapters.sim.engine_camera import EngineCamera
 from engine_adapters.sim.errors import SimulatorError
 from engine_adapters.sim.faults import FaultPlan, parse_fault
 from engine_adapters.sim.head_server import Head
@@ -50,6 +51,7 @@ class SimulatorOptions:
     snapshot_time_s: float = SNAPSHOT_TIME_S
     seed: int = 1
     faults: tuple[str, ...] = ()
+    engine: tuple[str, ...] = ()
     exit_with_parent: bool = False
 
 
@@ -74,6 +76,7 @@ async def simulated_studio(options: SimulatorOptions) -> AsyncIterator[dict[str,
         delay_frames=options.delay_frames,
         picture_time_s=options.picture_time_ms / 1000.0,
         head_speed_deg_s=options.head_speed_deg_s,
+        camera=EngineCamera.parse(options.engine),
     )
     clock = time.monotonic
     studio = Studio(lens, room, setup, clock=clock)

@@ -228,8 +228,7 @@ class _Canvas:
     def _black_out_beyond_fold(self) -> None:
         """No ray reaches the pixels beyond the fold."""
         optics = self._view.optics
-        fold = optics.fold_radius
-        limit = fold * (1.0 + optics.k1 * fold**2 + optics.k2 * fold**4)
+        limit = optics.fold_distorted
         cu, cv = optics.center_px
         x2 = ((np.arange(self._width) - cu) / optics.f_px) ** 2
         y2 = ((np.arange(self._height) - cv) / (optics.f_px * optics.pixel_aspect)) ** 2

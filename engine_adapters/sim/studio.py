@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from engine_adapters.sim.engine_camera import MAX_FOV_DEG, MIN_FOV_DEG, EngineCamera
 from engine_adapters.sim.errors import SimulatorError
 from engine_adapters.sim.lens_truth import ZoomLens
 from engine_adapters.sim.optics import Optics, View
@@ -21,6 +22,7 @@ MAX_PAN_DEG = 170.0
 MIN_TILT_DEG, MAX_TILT_DEG = -60.0, 90.0
 MAX_ROLL_DEG = 180.0
 _HISTORY_S = 5.0
+_FOV_AT_START_DEG = 50.0
 
 
 class StudioError(SimulatorError):
@@ -41,14 +43,6 @@ class SceneNames:
     background_visible: str = "background.visible"
     object_visible: str = "object.visible"
     tracking_camera: str = "Cam0"
-
-
-@dataclass(frozen=True, slots=True)
-class EngineModel:
-    """The engine's own camera: ``pixel_aspect`` of its render. Its lens is the conventions' (k1, k2 for a radius in
-    focal lengths, undistorted to distorted; centre shift an offset in px; FoV horizontal in degrees; nodal in mm)."""
-
-    pixel_aspect: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +108,7 @@ class StudioSetup:
     head_settle_s: float = 0.05
     lens_travel_s: float = 0.5
     names: SceneNames = field(default_factory=SceneNames)
-    model: EngineModel = field(default_factory=EngineModel)
+    camera: EngineCamera = field(default_factory=EngineCamera)
 
     def __post_init__(self) -> None:
         if not 0 <= self.delay_frames <= 100:
@@ -147,7 +141,14 @@ class Studio:
             names.object_visible: "object_visible",
         }
         values = dict.fromkeys(self._meaning.values(), "0")
-        values |= {"fov_x": "50", "background_visible": "1", "object_visible": "1"}
+        x0, y0 = setup.camera.shift_origin(lens.image_size)
+        values |= {
+            "fov_x": f"{setup.camera.fov_value(_FOV_AT_START_DEG, lens.image_size):.12g}",
+            "center_shift_x": f"{x0:g}",
+            "center_shift_y": f"{y0:g}",
+            "background_visible": "1",
+            "object_visible": "1",
+        }
         self._times_s = [-math.inf]
         self._values: list[Mapping[str, str]] = [values]
         first = lens.levels[0]
@@ -167,7 +168,8 @@ class Studio:
             _switch(value)
         else:
             number = _number(value)
-            if meaning == "fov_x" and not 0.01 <= number <= 175.0:
+            fov_x_deg = self.setup.camera.fov_x_deg(number, self.lens.image_size)
+            if meaning == "fov_x" and not MIN_FOV_DEG <= fov_x_deg <= MAX_FOV_DEG:
                 raise StudioError("FIELD OF VIEW OUT OF RANGE")
         self.statistics.value_sets += 1
         now = self._clock()
@@ -260,16 +262,13 @@ class Studio:
             state = self.lens.at(pose.zoom, pose.focus)
             real = self._view(pose, state.optics, state.nodal_offset_mm), state.blur_px, round(state.noise_sigma, 2)
         if _switch(values["object_visible"]):
-            optics = Optics.from_fov(
-                self.lens.image_size,
-                float(values["fov_x"]),
-                float(values["k1"]),
-                float(values["k2"]),
-                (float(values["center_shift_x"]), float(values["center_shift_y"])),
-                self.setup.model.pixel_aspect,
-            )
-            virtual = self._view(pose, optics, float(values["nodal_offset"]))
+            optics, nodal_offset_mm = self._engine_lens(values)
+            virtual = self._view(pose, optics, nodal_offset_mm)
         return OutputState(real, virtual)
+
+    def _engine_lens(self, values: Mapping[str, str]) -> tuple[Optics, float]:
+        numbers = {name: float(value) for name, value in values.items() if not name.endswith("_visible")}
+        return self.setup.camera.optics(numbers, self.lens.image_size, self.lens.sensor_mm)
 
     def _view(self, pose: HeadPose, optics: Optics, nodal_offset_mm: float) -> View:
         return View(optics, self.room.pivot_m, pose.pan_deg, pose.tilt_deg, pose.roll_deg, nodal_offset_mm)
@@ -291,8 +290,7 @@ class Studio:
             raise StudioError("CAMERA NOT FOUND")
         pose, values = self.head(), self._values[-1]
         width, height = self.lens.image_size
-        fov_x = float(values["fov_x"])
-        tan_y = math.tan(math.radians(fov_x) / 2.0) * height / (width * self.setup.model.pixel_aspect)
+        optics, _ = self._engine_lens(values)
         axes = View(
             Optics(self.lens.image_size, 1.0), self.room.pivot_m, pose.pan_deg, pose.tilt_deg, pose.roll_deg
         ).axes
@@ -300,8 +298,8 @@ class Studio:
         rotation = [[float(part) for part in row] for row in axes]
         rows = [[*row, -(row[0] * x + row[1] * y + row[2] * z)] for row in rotation]
         return {
-            "FovX": fov_x,
-            "FovY": math.degrees(2.0 * math.atan(tan_y)),
+            "FovX": self.setup.camera.fov_x_deg(float(values["fov_x"]), self.lens.image_size),
+            "FovY": math.degrees(2.0 * math.atan(height / 2.0 / (optics.f_px * optics.pixel_aspect))),
             "AspectRatio": width / height,
             "PosX": x,
             "PosY": y,
