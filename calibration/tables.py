@@ -120,6 +120,29 @@ class Interpolation:
 
 
 @dataclass(frozen=True, slots=True)
+class EngineValues:
+    """What an engine is to be told for a level where that is not the level's own lens: the same quantities, in the
+    product's conventions, as the studio profile converts them."""
+
+    fov_x_deg: float
+    k1: float
+    k2: float
+    center_shift_px: tuple[float, float]
+    nodal_offset_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("fov_x_deg", "k1", "k2", "nodal_offset_mm"):
+            _finite(f"engine value {name}", getattr(self, name))
+        for value in self.center_shift_px:
+            _finite("engine value center_shift_px", value)
+
+    @classmethod
+    def of(cls, lens: Lens) -> EngineValues:
+        """The values of a lens to be asked for."""
+        return cls(lens.fov_x_deg, lens.k1, lens.k2, lens.center_shift_px, lens.nodal_offset_mm)
+
+
+@dataclass(frozen=True, slots=True)
 class LevelResult:
     """One level, a pair of encoder values (``zoom``, ``focus``), and what was measured there.
 
@@ -130,7 +153,8 @@ class LevelResult:
 
     ``residual_px``: real corners against the fitted model, RMS per coordinate. ``held_out_px``: the same on pictures
     left out of the fit. ``predicted_overlay_px``: overlay error expected from the covariance. ``engine_overlay_px``:
-    corners of the engine's own last render at the coefficients as published.
+    corners of the engine's own last render at the coefficients as published. ``engine_values``: what the engine must
+    be told to draw this lens, None where that is the lens itself.
 
     ``scenario`` 1, 2, 3 of the study (chapter 4.3), None where the method knows none. ``seconds``: how long the level
     took. ``reason``: why a level is degraded or failed. ``reasons``: why a quantity of :data:`REASON_KEYS` is None;
@@ -156,6 +180,7 @@ class LevelResult:
     held_out_px: PixelError | None = None
     predicted_overlay_px: PixelError | None = None
     engine_overlay_px: PixelError | None = None
+    engine_values: EngineValues | None = None
     scenario: int | None = None
     frames: Frames = Frames()
     seconds: float | None = None
@@ -229,6 +254,7 @@ class LevelResult:
         held_out_px: PixelError | None = None,
         predicted_overlay_px: PixelError | None = None,
         engine_overlay_px: PixelError | None = None,
+        engine_values: EngineValues | None = None,
         scenario: int | None = None,
         frames: Frames | None = None,
         seconds: float | None = None,
@@ -256,6 +282,7 @@ class LevelResult:
             held_out_px=held_out_px,
             predicted_overlay_px=predicted_overlay_px,
             engine_overlay_px=engine_overlay_px,
+            engine_values=engine_values,
             scenario=scenario,
             frames=frames or Frames(),
             seconds=seconds,

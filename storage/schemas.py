@@ -93,6 +93,16 @@ class FramesDocument(_Document):
     virtual: Count = Field(default=0, description="of the engine's own render")
 
 
+class EngineValuesDocument(_Document):
+    """What the engine is to be told for a level, in these conventions, as the studio profile converts them."""
+
+    fov_x_deg: Number
+    k1: Number
+    k2: Number
+    center_shift_px: tuple[Number, Number]
+    nodal_offset_mm: Number
+
+
 class LeftOutDocument(_Document):
     """A picture that the fit did not use, and why."""
 
@@ -136,6 +146,9 @@ class LevelDocument(_Document):
     predicted_overlay_px: PixelErrorDocument | None = Field(default=None, description="expected from the covariance")
     engine_overlay_px: PixelErrorDocument | None = Field(
         default=None, description="corners of the engine's own last render at the coefficients as published"
+    )
+    engine_values: EngineValuesDocument | None = Field(
+        default=None, description="what the engine is to be told to draw this lens; null: the lens itself"
     )
     scenario: Literal[1, 2, 3] | None = Field(default=None, description="as in the study, chapter 4.3")
     frames: FramesDocument | None = None
@@ -219,6 +232,7 @@ def level_to_document(level: tables.LevelResult) -> dict[str, Any]:
         "held_out_px": _pixel_error(level.held_out_px),
         "predicted_overlay_px": _pixel_error(level.predicted_overlay_px),
         "engine_overlay_px": _pixel_error(level.engine_overlay_px),
+        **({} if level.engine_values is None else {"engine_values": _engine_values(level.engine_values)}),
         "scenario": None if level.scenario is None else int(level.scenario),
         "frames": {"real": int(level.frames.real), "virtual": int(level.frames.virtual)},
         "seconds": _optional(level.seconds),
@@ -292,6 +306,7 @@ def _level(
             status=tables.LevelStatus(read.status),
             sigma=tables.Sigma(**read.sigma.model_dump()) if read.sigma else tables.Sigma(),
             frames=tables.Frames(**read.frames.model_dump()) if read.frames else tables.Frames(),
+            engine_values=tables.EngineValues(**read.engine_values.model_dump()) if read.engine_values else None,
             left_out=tuple(tables.LeftOut(left.picture, left.reason) for left in read.left_out),
             reason=reason,
             reasons=reasons,
@@ -345,6 +360,16 @@ def _pair(value: tuple[float, float] | None) -> list[float] | None:
 
 def _pixel_error(value: tables.PixelError | None) -> dict[str, float] | None:
     return None if value is None else {"rms": float(value.rms), "max": float(value.max)}
+
+
+def _engine_values(values: tables.EngineValues) -> dict[str, Any]:
+    return {
+        "fov_x_deg": float(values.fov_x_deg),
+        "k1": float(values.k1),
+        "k2": float(values.k2),
+        "center_shift_px": _pair(values.center_shift_px),
+        "nodal_offset_mm": float(values.nodal_offset_mm),
+    }
 
 
 def _read_pixel_error(read: PixelErrorDocument | None) -> tables.PixelError | None:

@@ -7,6 +7,7 @@ at the values as they will be published.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -16,12 +17,13 @@ from calibration.camera import project_points, target_points_world
 from calibration.compare import predicted_overlay
 from calibration.errors import CalibrationError, FoldedLens, InvalidInput, NotConverged, NotEnoughData
 from calibration.lens import Lens
+from calibration.solve.engine_check import EngineAgreement, EngineCheck
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, solve_level
-from calibration.solve.outcome import level_result, pixel_error
+from calibration.solve.outcome import level_result
 from calibration.solve.problem import View
 from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at, expected_points
-from calibration.tables import LeftOut, LevelResult, PixelError
+from calibration.tables import LeftOut, LevelResult
 from calibration.types import Detection, FloatArray, Refusal, Role, Target, TargetKind
 
 _PLACES: tuple[tuple[float, float, Role], ...] = (
@@ -90,11 +92,7 @@ class JointMethod:
         self._target = ""
         self._places: list[tuple[float, float, Role]] = []
         self._again: dict[int, tuple[float, float, Role]] = {}
-        self._checks: list[View] = []
-        self._engine_residuals: list[FloatArray] = []
-        self._engine_sigma_px = 0.0
-        self._check_failures: list[str] = []
-        self._engine_reason = "the engine's render was not checked"
+        self._check: EngineCheck | None = None
 
     @property
     def done(self) -> bool:
@@ -103,7 +101,7 @@ class JointMethod:
     @property
     def progress(self) -> float:
         total = 1 + self._options.min_views + self._options.verify_views
-        told = len(self._views) + len(self._engine_residuals)
+        told = len(self._views) + (self._check.renders if self._check is not None else 0)
         return 1.0 if self.done else min(told / total, 0.99)
 
     @property
@@ -133,21 +131,22 @@ class JointMethod:
         if self._stage is _Stage.PROBE:
             self._tell_probe(capture, observation)
         elif capture.source is Source.VIRTUAL:
-            self._tell_check(capture, observation)
+            self._tell_check(observation)
         else:
             self._tell_view(capture, observation)
 
     def result(self) -> LevelResult:
         if self._fit is None or self._problem:
             raise NotEnoughData(self._problem or "the level was not finished")
+        agreement, engine_problem = self._agreement()
         return level_result(
             self._fit,
             self._task.zoom,
             self._task.focus,
             held_out=held_out_residuals(self._fit, self._views),
-            engine_overlay_px=self._engine_overlay(),
-            engine_sigma_px=self._engine_sigma_px,
-            engine_reason=self._engine_reason,
+            engine=agreement,
+            engine_shortfall_px=self._shortfall_px(),
+            engine_problem=engine_problem,
             left_out=self._left_out,
         )
 
@@ -312,39 +311,46 @@ class JointMethod:
             self._end(f"{len(self._views)} pictures do not tell the lens's bend: its fit folds or does not converge")
             return
         usable = [v for v in self._views if v.name not in {name for name, _ in self._fit.dropped}]
-        # The last picture's pose first: the head stands there already.
-        self._checks = usable[::-1][: self._options.verify_views]
         self._stage = _Stage.VERIFY
-        if not self._checks:
+        if self._options.verify_views == 0:
             self._stage = _Stage.DONE
+            return
+        # The last picture's pose first: the head stands there already.
+        self._check = EngineCheck(self._lens(), usable[::-1], self._task.engine, first_views=self._options.verify_views)
 
     def _ask_check(self) -> Capture | None:
-        index = len(self._engine_residuals) + len(self._pending) + len(self._check_failures)
-        if index >= len(self._checks):
-            if not self._pending:
-                self._stage = _Stage.DONE
+        wanted = self._check.ask() if self._check is not None else None
+        if wanted is None:
+            self._stage = _Stage.DONE
             return None
-        if self._pending:
+        pose = wanted.view.camera_pose
+        if self._pending or pose is None:
             return None
-        view, lens = self._checks[index], self._lens()
-        if view.camera_pose is None:
-            return None
-        pan, tilt = view.camera_pose.pan_deg, view.camera_pose.tilt_deg
-        return self._capture(Source.VIRTUAL, view.target_name, pan, tilt, Role.FREE, lens=lens)
+        target = wanted.view.target_name
+        return self._capture(Source.VIRTUAL, target, pose.pan_deg, pose.tilt_deg, Role.FREE, lens=wanted.asked)
 
-    def _tell_check(self, capture: Capture, observation: Observation) -> None:
-        view = self._checks[len(self._engine_residuals) + len(self._check_failures)]
-        if isinstance(observation.result, Refusal):
-            self._check_failures.append(observation.result.reason)
-            self._engine_reason = f"the target was not found in the engine's render: {observation.result.reason}"
-        else:
-            self._engine_residuals.append(_matched(view.detection, observation.result))
-            self._engine_sigma_px = max(self._engine_sigma_px, _sigma_px(observation.result))
-        if len(self._engine_residuals) + len(self._check_failures) >= len(self._checks):
+    def _tell_check(self, observation: Observation) -> None:
+        if self._check is None:
+            return
+        self._check.tell(observation.result)
+        if self._check.done:
             self._stage = _Stage.DONE
 
-    def _engine_overlay(self) -> PixelError | None:
-        return pixel_error(self._engine_residuals)
+    def _agreement(self) -> tuple[EngineAgreement | None, str]:
+        """How the engine's render agrees; else the reason why that is not known, empty where it was not asked."""
+        if self._check is None:
+            return None, ""
+        try:
+            return self._check.result(), ""
+        except NotEnoughData as error:
+            return None, str(error)
+
+    def _shortfall_px(self) -> float:
+        """How far the engine's best picture of this lens is off by its very camera, as far as that was learned."""
+        try:
+            return self._task.engine.shortfall_px(self._lens())
+        except CalibrationError:
+            return math.inf
 
     # --- shared ---
 
@@ -399,14 +405,3 @@ class JointMethod:
 
 def _name(capture: Capture, observation: Observation) -> str:
     return observation.picture or f"step {capture.step}"
-
-
-def _matched(real: Detection, virtual: Detection) -> FloatArray:
-    """Virtual minus real corners (N, 2) px for the points found in both."""
-    _, first, second = np.intersect1d(real.point_ids, virtual.point_ids, return_indices=True)
-    return np.asarray(virtual.points_px[second] - real.points_px[first])
-
-
-def _sigma_px(detection: Detection) -> float:
-    """The least certain coordinate of a detection, one sigma."""
-    return float(np.sqrt(np.max(np.diagonal(detection.covariance_px2, axis1=1, axis2=2))))

@@ -9,13 +9,16 @@ import numpy as np
 
 from calibration.camera import target_points_world, world_to_camera
 from calibration.compare import NEGLIGIBLE_PX, edge_effect_px, predicted_overlay
+from calibration.lens import Lens
 from calibration.solve.center_shift import center_shift_from_centre
+from calibration.solve.engine_check import EngineAgreement
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import MISFIT_PX
 from calibration.solve.problem import View
 from calibration.tables import (
     EVIDENCE_QUANTITIES,
     LENS_QUANTITIES,
+    EngineValues,
     LeftOut,
     LevelResult,
     LevelStatus,
@@ -42,6 +45,7 @@ _NODAL_LOOSE_MM = 2.0
 _NODAL_HINT = 3.0
 # Sigmas of the nodal offset at which a level is called degraded before it is certain enough to be used.
 
+NO_ENGINE = "no engine's render was compared"
 NODAL_NOT_MEASURED = "not measured: that takes pictures from known head angles of a surveyed target"
 
 
@@ -60,13 +64,14 @@ def level_result(
     focus: float,
     *,
     held_out: Mapping[str, FloatArray],
-    engine_overlay_px: PixelError | None = None,
-    engine_sigma_px: float = 0.0,
-    engine_reason: str = "no engine took part",
+    engine: EngineAgreement | None = None,
+    engine_shortfall_px: float = 0.0,
+    engine_problem: str = "",
     left_out: Sequence[LeftOut] = (),
 ) -> LevelResult:
-    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it.
-    ``engine_sigma_px``: how well the corners of the engine's render were found.
+    """The level's entry. ``held_out`` as :func:`calibration.solve.level.held_out_residuals` gives it. ``engine``: how
+    the engine's render agreed, None where none took part, or for ``engine_problem``; ``engine_shortfall_px``: how far
+    its best picture of this lens is off by the engine's very camera.
     """
     expected = predicted_overlay(fit.lens, fit.covariance)
     every_left_out = (*left_out, *(LeftOut(name, why) for name, why in fit.dropped), *_outliers(fit))
@@ -83,9 +88,14 @@ def level_result(
         )
     if held is None:
         reasons["held_out_px"] = "no picture could be spared from the fit"
+    engine_overlay_px = pixel_error(engine.residuals_px) if engine is not None else None
     if engine_overlay_px is None:
-        reasons["engine_overlay_px"] = engine_reason
-    trouble = _trouble(fit, expected.max_px, engine_overlay_px, engine_sigma_px)
+        reasons["engine_overlay_px"] = engine_problem or NO_ENGINE
+    trouble = _trouble(fit, expected.max_px)
+    if engine_problem:
+        trouble.append(engine_problem)
+    if engine is not None and engine_overlay_px is not None:
+        trouble += _engine_trouble(fit, expected.max_px, engine, engine_overlay_px, engine_shortfall_px)
     sigma = fit.sigma
     return LevelResult.from_lens(
         zoom,
@@ -105,6 +115,7 @@ def level_result(
         held_out_px=held,
         predicted_overlay_px=PixelError(expected.rms_px, expected.max_px),
         engine_overlay_px=engine_overlay_px,
+        engine_values=_engine_values(fit.lens, engine),
         scenario=1 if edge_effect_px(fit.lens)[1] <= NEGLIGIBLE_PX else 2,
         left_out=every_left_out,
     )
@@ -133,7 +144,7 @@ def _useless(fit: LevelFit, expected_max_px: float) -> str | None:
     return None
 
 
-def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None, engine_sigma_px: float) -> list[str]:
+def _trouble(fit: LevelFit, expected_max_px: float) -> list[str]:
     trouble: list[str] = []
     if not math.isfinite(expected_max_px) or expected_max_px > USABLE_OVERLAY_PX:
         advice = "take more pictures, the target nearer the corners"
@@ -158,13 +169,30 @@ def _trouble(fit: LevelFit, expected_max_px: float, engine: PixelError | None, e
                 f"the pictures hint at a nodal offset of {seen_mm:.0f} ± {sigma_mm:.0f} mm, not "
                 f"{fit.lens.nodal_offset_mm:g} mm; if so the field of view is off: add a target at another distance"
             )
-    agrees_px = max(ENGINE_AGREES_PX, 5 * expected_max_px, 6 * fit.rms_px, 5 * engine_sigma_px)
-    if engine is not None and engine.max > agrees_px:
+    return trouble
+
+
+def _engine_trouble(
+    fit: LevelFit, expected_max_px: float, engine: EngineAgreement, overlay: PixelError, shortfall_px: float
+) -> list[str]:
+    agrees_px = max(ENGINE_AGREES_PX, 5 * expected_max_px, 6 * fit.rms_px, 5 * engine.sigma_px)
+    trouble = [engine.trouble] if engine.trouble else []
+    if shortfall_px > ENGINE_AGREES_PX:
         trouble.append(
-            f"the engine's render is up to {engine.max:.1f} px off at these values: its lens model is not the "
+            f"the engine cannot draw this lens nearer than {shortfall_px:.2f} px everywhere: its polynomial goes the "
+            "other way"
+        )
+    if not trouble and overlay.max > agrees_px:
+        trouble.append(
+            f"the engine's render is up to {overlay.max:.1f} px off at these values: its lens model is not the "
             "profile's (check the radius unit of k1 and k2, the centre shift's sign and origin, the FoV's axis)"
         )
     return trouble
+
+
+def _engine_values(lens: Lens, engine: EngineAgreement | None) -> EngineValues | None:
+    """What the engine was told, where that was not the lens itself."""
+    return None if engine is None or engine.asked == lens else EngineValues.of(engine.asked)
 
 
 def shift_only_result(

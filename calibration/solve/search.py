@@ -25,6 +25,7 @@ import numpy as np
 from calibration.camera import project_points, project_target, target_points_world
 from calibration.errors import InvalidInput
 from calibration.lens import Lens
+from calibration.solve.engine_model import IDENTITY, EngineModel
 from calibration.tables import LevelResult
 from calibration.types import CameraPose, DetectionResult, FloatArray, Role, Target
 
@@ -75,7 +76,7 @@ class LevelTask:
     ``angle_sigma_deg`` the head's encoders; ``nodal_offset_mm`` stands unless the pictures contradict it, with a
     ``nodal_sigma_mm`` it is a prior; ``guess`` the lens of a level that differs little (another focus), or None;
     ``neighbour`` that of the level measured before, which only says what to look at first. ``pan_range_deg`` and
-    ``tilt_range_deg`` bound the head.
+    ``tilt_range_deg`` bound the head. ``engine``: how the engine draws, as learned.
     """
 
     zoom: float
@@ -92,6 +93,7 @@ class LevelTask:
     neighbour: Lens | None = None
     pan_range_deg: tuple[float, float] = (-90.0, 90.0)
     tilt_range_deg: tuple[float, float] = (-45.0, 45.0)
+    engine: EngineModel = IDENTITY
 
     def __post_init__(self) -> None:
         if not self.targets:

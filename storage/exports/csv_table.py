@@ -3,7 +3,8 @@
 RFC 4180 (commas, CRLF, doubled quotes), UTF-8, one header row with units in the names. What holds for the whole
 table (``lens`` to ``interpolation_...``) is repeated in every row, so that rows can be sorted, filtered and joined; on
 reading, all rows must agree on it. Columns may stand in any order and further columns are ignored. Numbers have all
-their digits; an empty cell is "not told". ``left_out`` and ``reasons`` hold JSON.
+their digits; an empty cell is "not told". ``left_out``, ``reasons`` and ``engine_values`` hold
+JSON.
 
 A text cell that a spreadsheet would take for a formula (it begins with = + - @, tab or carriage return) gets a
 leading apostrophe, which the reader takes away again.
@@ -77,7 +78,10 @@ _LEVEL_COLUMNS: dict[str, tuple[_Path, str]] = {
     "seconds": (("seconds",), _FLOAT),
     "left_out": (("left_out",), _JSON),
     "reasons": (("reasons",), _JSON),
+    "engine_values": (("engine_values",), _JSON),
 }
+_LATER_COLUMNS = ("engine_values",)
+"""Columns that files of earlier versions do not have; without one, nothing of it is told."""
 
 
 def write_csv(table: LensTable) -> bytes:
@@ -95,7 +99,7 @@ def write_csv(table: LensTable) -> bytes:
 def read_csv(data: bytes) -> LensTable:
     """The table of a CSV file. Raises :class:`BadDocument`, naming row and column."""
     header, rows = _rows(decode_text(data))
-    missing = [name for name in (*_TABLE_COLUMNS, *_LEVEL_COLUMNS) if name not in header]
+    missing = [name for name in (*_TABLE_COLUMNS, *_LEVEL_COLUMNS) if name not in (*header, *_LATER_COLUMNS)]
     if missing:
         hint = "save it with commas between the columns" if ";" in header[0] else "is this a lens table file?"
         raise BadDocument("header", f"has no column {', '.join(missing[:3])}", hint)
@@ -137,7 +141,7 @@ def _rows(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
 def _cell(document: Mapping[str, Any], path: _Path, kind: str) -> str:
     value: Any = document
     for part in path:
-        value = None if value is None else value[part]
+        value = None if value is None else value.get(part) if isinstance(value, Mapping) else value[part]
     if kind == _JSON:
         return json.dumps(value, ensure_ascii=False) if value else ""
     if value is None:
@@ -150,7 +154,7 @@ def _cell(document: Mapping[str, Any], path: _Path, kind: str) -> str:
 
 def _read_cells(cells: Mapping[str, str], columns: Mapping[str, tuple[_Path, str]], number: int) -> dict[str, Any]:
     """The part of the document that the cells of one row make, without what is empty."""
-    flat = {path: _value(cells[name], kind, f"row {number}, {name}") for name, (path, kind) in columns.items()}
+    flat = {path: _value(cells.get(name, ""), kind, f"row {number}, {name}") for name, (path, kind) in columns.items()}
     for name, (path, _) in columns.items():
         partner = (*path[:-1], 1 - path[-1]) if isinstance(path[-1], int) else None
         if partner is not None and flat[path] is None and flat[partner] is not None:

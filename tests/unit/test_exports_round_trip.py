@@ -16,6 +16,7 @@ from calibration.lens import Lens
 from calibration.tables import (
     EVIDENCE_QUANTITIES,
     REASON_KEYS,
+    EngineValues,
     Frames,
     Interpolation,
     LeftOut,
@@ -139,6 +140,7 @@ def golden_table() -> LensTable:
         held_out_px=PixelError(0.03, 0.07),
         predicted_overlay_px=PixelError(0.02, 0.05),
         engine_overlay_px=PixelError(0.03, 0.08),
+        engine_values=EngineValues(71.5, -0.2, 0.07, (962.5, 537.5), 121.0),
         scenario=1,
         frames=Frames(4, 5),
         seconds=0.6,

@@ -49,7 +49,7 @@ def drive(
         if capture is not None:
             captures.append(capture)
             waiting.append(capture)
-            assert len(captures) < 60
+            assert len(captures) < 80
             continue
         if method.done:
             break
@@ -97,17 +97,37 @@ def test_a_guess_from_the_level_before_saves_a_picture() -> None:
     assert len(with_guess) <= len(without)
 
 
-def test_an_engine_with_another_lens_model_is_reported_not_believed() -> None:
+def test_an_engine_with_another_lens_model_is_searched_not_believed() -> None:
     truth = lens(62, -0.1, 0.02)
     level = task()
 
     def half_width(values: Lens) -> Lens:  # an engine that takes k1, k2 with radius 1 at half width
         return values.with_hw(values.f_px, values.k1, values.k2)
 
-    result, _ = drive(JointMethod(level), truth, level, engine=half_width)
-    assert result.status is LevelStatus.DEGRADED
-    assert "the engine's render is up to" in (result.reason or "")
+    result, captures = drive(JointMethod(level), truth, level, engine=half_width)
+    assert result.status is LevelStatus.OK, result.reason
     assert overlay(truth, result.lens(SIZE)).max_px < 0.15
+    told = result.engine_values
+    assert told is not None, "the engine is not asked for the lens itself"
+    drawn = half_width(Lens.from_fov(SIZE, told.fov_x_deg, told.k1, told.k2, told.center_shift_px))
+    assert overlay(truth, drawn).max_px < 0.3
+    assert len(captures) <= 40
+
+
+def test_an_engine_that_cannot_draw_the_lens_is_said_so() -> None:
+    truth = lens(62, -0.02, 0.0)
+    level = task()
+
+    def straight(values: Lens) -> Lens:  # an engine that takes no notice of k1 and k2
+        return replace(values, k1=0.0, k2=0.0)
+
+    result, captures = drive(JointMethod(level), truth, level, engine=straight)
+    assert result.status is LevelStatus.DEGRADED
+    assert "could not be brought nearer" in (result.reason or "")
+    assert result.engine_overlay_px is not None
+    assert result.engine_overlay_px.max > 0.3
+    assert overlay(truth, result.lens(SIZE)).max_px < 0.15
+    assert len(captures) < 80
 
 
 def test_a_target_that_is_nowhere_fails_with_every_reason() -> None:
