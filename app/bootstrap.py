@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.engines import Engines, PictureFacts, Studio
+from app.engines import EngineFacts, Engines, PictureFacts, Studio
 from app.events import EventBroker
 from app.jobs.cpu import Cpu
 from app.jobs.runner import JobRunner
@@ -62,7 +62,24 @@ def make_studio(profile: StudioProfile, ask: AskOperator | None = None, *, slow_
     else:
         head = OperatorHead(ask or _nobody, answer_timeout_s=profile.head.answer_timeout_s)
     frames: FrameSource = R3Snapshots.from_profile(profile) if slow_pictures else MockBoardFrames.from_profile(profile)
-    return Studio(R3Engine.from_profile(profile), frames, head, profile.picture.transfer)
+    return Studio(R3Engine.from_profile(profile), frames, head, profile.picture.transfer, engine_facts(profile))
+
+
+def engine_facts(profile: StudioProfile) -> EngineFacts:
+    """What a profile says of how its engine counts."""
+    engine, picture = profile.engine, profile.picture
+    return EngineFacts(
+        image_size=picture.image_size,
+        pixel_aspect=picture.pixel_aspect,
+        sensor_width_mm=picture.sensor_mm[0],
+        radius_unit=engine.radius_unit,
+        direction=engine.direction,
+        center_shift=engine.center_shift,
+        pixel_centres=engine.pixel_centres,
+        center_shift_signs=(engine.center_shift_sign_x, engine.center_shift_sign_y),
+        fov_axis=engine.fov_axis,
+        nodal_sign=engine.nodal_sign,
+    )
 
 
 def add_engine(

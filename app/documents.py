@@ -203,6 +203,11 @@ class JobRequest(_Strict):
     angle_sigma_deg: NotNegative = Field(default=0.0, description="the head's encoders, one sigma")
     nodal_offset_mm: Finite = Field(default=0.0, description="pivot to entrance pupil; stands unless contradicted")
     nodal_sigma_mm: NotNegative = Field(default=0.0, description="how well it is known; more than 0: only a prior")
+    learn_engine: bool = Field(
+        default=True,
+        description="learn how the engine draws from about eight renders before the first level; false: the studio "
+        "profile is taken at its word, and each level's render alone tells whether it is right",
+    )
     goal_px: Positive = Field(default=0.03, description="largest expected overlay error at which pictures stop")
     max_views: Annotated[int, Field(ge=2, le=100)] = 12
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -44,13 +44,53 @@ class PictureFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class EngineFacts:
+    """What a studio profile says of how its engine counts, in the profile's own words (``engine.*``)."""
+
+    image_size: tuple[int, int] = (1920, 1080)
+    pixel_aspect: float = 1.0
+    sensor_width_mm: float = 9.59
+    radius_unit: str = "focal_length"
+    direction: str = "undistorted_to_distorted"
+    center_shift: str = "offset"
+    pixel_centres: str = "whole"
+    center_shift_signs: tuple[int, int] = (1, 1)
+    fov_axis: str = "x"
+    nodal_sign: int = 1
+
+    @property
+    def unit_px(self) -> Mapping[str, float | None]:
+        """Radius 1 of k1 and k2 in px for each unit that the profile knows; None: the focal length."""
+        half_width = self.image_size[0] / 2
+        half_height = self.image_size[1] / (2 * self.pixel_aspect)
+        return {
+            "focal_length": None,
+            "half_width": half_width,
+            "half_height": half_height,
+            "half_diagonal": math.hypot(half_width, half_height),
+            "sensor_mm": self.image_size[0] / self.sensor_width_mm,
+        }
+
+    def unit_gain(self, unit: str, focal_gain: float) -> tuple[int, float]:
+        """(unit_power, k1_gain) of :class:`calibration.solve.engine_model.EngineModel` for an engine that counts in
+        ``unit`` behind this profile, its focal length ``focal_gain`` times the one asked for."""
+        half_width = self.image_size[0] / 2
+        says, behaves = self.unit_px[self.radius_unit], self.unit_px[unit]
+        power = (says is None) - (behaves is None)
+        gain = ((says or half_width) / (behaves or half_width * focal_gain)) ** 2
+        return power, gain
+
+
+@dataclass(frozen=True, slots=True)
 class Studio:
-    """What a job talks to: an engine, its output, and what turns the camera. ``transfer``: how pictures code light."""
+    """What a job talks to: an engine, its output, and what turns the camera. ``transfer``: how pictures code light;
+    ``facts``: what the profile says of the engine."""
 
     engine: RenderEngine
     frames: FrameSource
     head: CameraHead
     transfer: Transfer = Transfer.BT709
+    facts: EngineFacts = EngineFacts()
 
     async def close(self) -> None:
         """Release every connection."""

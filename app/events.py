@@ -12,13 +12,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import datetime
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from app.errors import TooManyListeners
+from calibration.solve.engine_learning import LearnedEngine
 from calibration.tables import LevelResult, PixelError
 from storage.records import EventDraft, EventRecord
 from storage.schemas import format_utc
@@ -181,6 +184,56 @@ class LevelFailed(LevelEvent):
     reason: Reason
 
 
+class EngineModelData(BaseModel):
+    """How an engine draws, against a profile that is right: all gains 1, offsets 0, ``unit_power`` 0."""
+
+    model_config = ConfigDict(frozen=True)
+
+    direction: Literal["undistorted_to_distorted", "reverse"]
+    unit_power: int = Field(description="1 or -1: k1 grows with the focal length squared, or its inverse, besides")
+    focal_gain: Number
+    k1_gain: Number
+    k2_gain: Number
+    shift_gain: tuple[Number, Number]
+    shift_offset_px: tuple[Number, Number]
+    nodal_gain: Number
+    aspect_gain: Number
+
+
+class EngineLearned(Event):
+    """How the engine draws was learned from renders at known values, before the first level."""
+
+    kind: Literal["engine_learned"] = "engine_learned"
+    engine: str
+    trusted: bool = Field(description="the model explains the renders, and no other does")
+    reason: str | None = Field(default=None, description="why it is not trusted")
+    renders: Count
+    rms_px: Number | None = Field(default=None, description="left between model and renders, per coordinate, px")
+    next_rms_px: Number | None = Field(default=None, description="the same for the best model of another kind, px")
+    noise_px: Number | None = Field(default=None, description="how exactly the renders' corners are known, px")
+    model: EngineModelData
+    disagreements: tuple[str, ...] = Field(default=(), description="profile settings that the engine contradicts")
+
+    @classmethod
+    def of(cls, engine: str, learned: LearnedEngine, disagreements: tuple[str, ...]) -> EngineLearned:
+        """The event of what was learned."""
+
+        def told(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        return cls(
+            engine=engine,
+            trusted=learned.trusted,
+            reason=learned.reason or None,
+            renders=learned.renders,
+            rms_px=told(learned.rms_px),
+            next_rms_px=told(learned.next_rms_px),
+            noise_px=told(learned.noise_px),
+            model=EngineModelData(**asdict(learned.model)),
+            disagreements=disagreements,
+        )
+
+
 class EngineRestored(Event):
     """The engine has its values back as they were found."""
 
@@ -239,6 +292,7 @@ AnyEvent = Annotated[
     | LevelProgress
     | LevelDone
     | LevelFailed
+    | EngineLearned
     | EngineRestored
     | EngineDirty
     | JobDone

@@ -293,8 +293,6 @@ def parse_profile(text: str, *, where: str = "studio profile") -> StudioProfile:
 def require_available(profile: StudioProfile) -> None:
     """Refuse a valid profile that asks for what this version cannot do. Raises ``ProfileError``."""
     problems = []
-    if profile.engine.direction == "reverse":
-        problems.append(REVERSE_NOT_AVAILABLE)
     if profile.head.kind == "visca":
         problems.append(VISCA_NOT_AVAILABLE)
     if profile.tracking.kind != "none":
@@ -303,10 +301,6 @@ def require_available(profile: StudioProfile) -> None:
         raise ProfileError(*problems, where="studio profile")
 
 
-REVERSE_NOT_AVAILABLE = (
-    'engine.direction = "reverse": needs the engine learned from its renders; not available yet; '
-    'use "undistorted_to_distorted"'
-)
 VISCA_NOT_AVAILABLE = 'head.kind = "visca": not available yet; use "operator" or "simulated"'
 
 

@@ -13,11 +13,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from app.documents import JobRequest, one_line
-from app.engines import EngineError, EngineInfo, Engines, Lease, PictureFacts
+from app.engines import EngineError, EngineInfo, Engines, Lease, PictureFacts, Studio
 from app.errors import QueueFull
 from app.events import (
     AnyEvent,
     EngineDirty,
+    EngineLearned,
     EngineRestored,
     EventBroker,
     JobCancelled,
@@ -34,6 +35,7 @@ from app.events import (
     make,
 )
 from app.jobs.cpu import Cpu
+from app.jobs.engine import learn
 from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
 from app.jobs.state import sources
@@ -42,9 +44,11 @@ from app.jobs.taking import PictureTaker
 from calibration.compare import Overlay, predicted_overlay
 from calibration.errors import CalibrationError
 from calibration.solve.alternating import AlternatingMethod
+from calibration.solve.engine_model import Direction, EngineModel
 from calibration.solve.joint import JointMethod, JointOptions
 from calibration.solve.search import LevelMethod, LevelTask
 from calibration.tables import LensTable, LevelResult, LevelStatus
+from calibration.types import TargetKind
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import LensValues, RenderEngine
 from storage.errors import StaleState, StorageError
@@ -287,11 +291,12 @@ class JobRunner:
         text = f"the output follows a change after at most {delay_ms:.0f} ms; a picture takes {picture_ms:.0f} ms"
         await self._event(job_id, Note(text=text))
         ordered = order([(level.zoom, level.focus) for level in request.levels])
+        model = await self._learn(job_id, request, lease.studio, taker, ordered[0])
         results: list[LevelResult] = []
         failures = 0
         for ordinal, (zoom, focus) in enumerate(ordered):
             await self._event(job_id, LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus))
-            task = level_task(request, zoom, focus, results)
+            task = level_task(request, zoom, focus, results, model)
             method = make_method(request, task)
             outcome, problem = await self._level(job_id, ordinal, method, task, taker, lease)
             results.append(outcome.result)
@@ -310,6 +315,27 @@ class JobRunner:
         except (AdapterError, TimeoutError) as error:
             await self._event(job_id, Note(text=f"head and lens were not turned back: {error}"))
         return results
+
+    async def _learn(
+        self, job_id: str, request: JobRequest, studio: Studio, taker: PictureTaker, first: tuple[float, float]
+    ) -> EngineModel:
+        """How the engine draws; what of it contradicts the studio profile is told, never silently followed."""
+        believed = EngineModel(direction=Direction(studio.facts.direction))
+        task = level_task(request, *first, [], believed)
+        if not request.learn_engine or all(t.kind is TargetKind.LIGHT for t in task.targets.values()):
+            return believed
+        known = await learn(taker, task, studio.facts, studio.transfer, self._cpu)
+        await self._event(job_id, EngineLearned.of(request.engine, known.learned, known.disagreements))
+        told = list(known.disagreements)
+        if told:
+            told.append("the engine is told what its own camera needs; correct the studio profile")
+        if not known.learned.trusted:
+            told.append(f"the engine is not understood: {known.learned.reason}; each level's values are searched on it")
+        for text in told:
+            await self._event(job_id, Note(text=text))
+        if told and request.method == "alternating":
+            raise EngineError(f"the alternating method takes the engine at its profile's word: {told[0]}")
+        return known.model
 
     async def _level(
         self, job_id: str, ordinal: int, method: LevelMethod, task: LevelTask, taker: PictureTaker, lease: Lease

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from app.documents import JobRequest
 from calibration.lens import Lens
+from calibration.solve.engine_model import IDENTITY, EngineModel
 from calibration.solve.search import LevelTask
 from calibration.tables import LevelResult, LevelStatus
 
@@ -42,8 +43,10 @@ def last_measured(done: Sequence[LevelResult], request: JobRequest) -> Lens | No
     return measured[-1].lens(request.image_size, request.pixel_aspect) if measured else None
 
 
-def level_task(request: JobRequest, zoom: float, focus: float, done: Sequence[LevelResult]) -> LevelTask:
-    """What a method must know of one level of a job, after the levels ``done``.
+def level_task(
+    request: JobRequest, zoom: float, focus: float, done: Sequence[LevelResult], engine: EngineModel = IDENTITY
+) -> LevelTask:
+    """What a method must know of one level of a job, after the levels ``done``, on an engine that draws so.
 
     Once a level has shown that the pupil is not where the job says, no later one may take it to be there: the nodal
     offset then starts from the level measured last, as a prior.
@@ -62,4 +65,5 @@ def level_task(request: JobRequest, zoom: float, focus: float, done: Sequence[Le
         nodal_sigma_mm=max(_NODAL_CHANGE_MM, request.nodal_sigma_mm) if nodal else request.nodal_sigma_mm,
         guess=guess_from(done, zoom, request),
         neighbour=last_measured(done, request),
+        engine=engine,
     )

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from calibration.camera import rays_of, target_points_world, world_to_camera
-from calibration.errors import CalibrationError, InvalidInput
+from calibration.errors import InvalidInput, NotConverged
 from calibration.lens import Lens
 from calibration.solve.engine_model import Direction, EngineModel
 from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at
@@ -29,7 +29,7 @@ TRUSTED_SIGMAS = 3.0
 CLEARLY_BETTER = 2.0
 """The next best explanation must leave this many times the residual."""
 SNAP_SIGMAS = 5.0
-SNAP_LOOSE = 2e-3
+SNAP_LOOSE = 0.01
 """A gain this near to a whole number, and within five sigma of it, is that number."""
 
 _FILL = 0.42
@@ -39,12 +39,20 @@ _PLACE = (0.62, 0.36)
 _LARGEST_F_OF_HALF_WIDTH = 2.2
 _LEAST_RENDERS = 6
 _FIRST_K1_HW = 0.004
-_BEND_PX = 9.0
+_BEND_PX = 24.0
 # How far k1 and k2 may move a corner: far beyond the corners' noise, far from folding the picture.
-_MOST_BEND_HW = 0.06
+_MOST_BEND_HW = 0.15
 _SHIFT_PX = (14.0, 9.0)
 _NODAL_MM = 120.0
 _STALE_PX = 1e-6
+_UNSEEN_PX = 1e-3
+# What a parameter moves in all corners together, below which the renders do not show it.
+_SNAP_PX, _SNAP_NODAL = 0.2, 0.05
+_NODAL_GAINS = (1.0, -1.0, 1000.0, -1000.0, 0.001, -0.001)
+_REVERSE_STEPS = 25
+_FARTHEST = 1e5
+_NODAL_SEEN = 1e-3
+# 120 mm make a target at less than 100 m larger or smaller by more than this.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +86,8 @@ class LearnedEngine:
 
 
 PARAMETERS = ("focal_gain", "k1_gain", "k2_gain", "shift_gain_x", "shift_gain_y", "shift_offset_x_px",
-              "shift_offset_y_px", "nodal_gain")  # fmt: skip
+              "shift_offset_y_px", "nodal_gain", "aspect_gain")  # fmt: skip
+_SCALES = np.array([1e-2, 0.1, 0.1, 0.1, 0.1, 10.0, 10.0, 0.5, 1e-2])
 _KINDS = tuple((direction, power) for direction in Direction for power in (0, 1, -1))
 
 
@@ -126,12 +135,17 @@ class EngineLearning:
         lens = self._pending.pop(observation.step)
         if isinstance(observation.result, Refusal):
             self._refused.append(observation.result.reason)
+            if lens.nodal_offset_mm == _NODAL_MM:
+                # An engine that counts in metres where the profile says millimetres is out of the room.
+                self._plan.append("nodal small")
             if not self._renders:
                 if self._origins:
                     self._plan = ["base"]
                 return
         else:
             self._renders.append(Render(lens, observation.camera_pose, self._target, observation.result))
+            if lens.nodal_offset_mm == _NODAL_MM and self._nodal_unseen():
+                self._plan.append("nodal large")
             if len(self._renders) == 1:
                 self._plan = ["shift", "k1 small", "k1", "k2", "near", "far", "nodal"]
 
@@ -163,12 +177,22 @@ class EngineLearning:
             "k1 small": (1.0, _FIRST_K1_HW, 0.0, (0.0, 0.0), 0.0),
             "k1": (1.0, bend1, 0.0, (0.0, 0.0), 0.0),
             "k2": (1.0, 0.0, bend2, (0.0, 0.0), 0.0),
-            "near": (1.25, -0.8 * bend1, 0.0, (-x, y), 0.0),
-            "far": (0.75, bend1, bend2, (0.5 * x, -y), 0.0),
-            "nodal": (1.0, -0.5 * bend1, 0.5 * bend2, (-x, -y), _NODAL_MM),
+            "near": (1.3, -0.8 * bend1, 0.0, (-x, y), 0.0),
+            "far": (0.6, bend1, bend2, (0.5 * x, -y), 0.0),
+            "nodal": (1.0, 0.0, 0.0, (-x, -y), _NODAL_MM),
+            "nodal small": (1.0, 0.0, 0.0, (-x, -y), _NODAL_MM / 1000),
+            "nodal large": (1.0, 0.0, 0.0, (-x, -y), _NODAL_MM * 1000),
         }[what]
         place = (self._origin[0] + shift[0], self._origin[1] + shift[1])
         return replace(base, center_shift_px=place, nodal_offset_mm=nodal_mm).with_hw(f_px * base.f_px, k1_hw, k2_hw)
+
+    def _nodal_unseen(self) -> bool:
+        """Whether the last render shows the target as large as the first, though the pupil should have moved."""
+        sizes = [
+            float(np.linalg.norm(np.ptp(r.detection.points_px, axis=0))) for r in (self._renders[0], self._renders[-1])
+        ]
+        same = len(self._renders[0].detection.points_px) == len(self._renders[-1].detection.points_px)
+        return same and abs(sizes[1] / sizes[0] - 1) < _NODAL_SEEN
 
     def _bends(self) -> tuple[float, float]:
         """k1_hw and k2_hw that move the corners by about ``_BEND_PX``, as the first small k1 shows."""
@@ -192,7 +216,9 @@ class EngineLearning:
 def learn_engine(renders: Sequence[Render]) -> LearnedEngine:
     """The model that explains the renders best: each kind fitted by least squares, the residuals compared."""
     noise_px = _noise_px(renders)
-    fits = sorted((_fitted(renders, direction, power, noise_px) for direction, power in _KINDS), key=lambda f: f.rms_px)
+    corners = _Corners(renders)
+    fits = [_fitted(corners, renders, direction, power, noise_px) for direction, power in _KINDS]
+    fits.sort(key=lambda fit: fit.rms_px)
     best = fits[0]
     others = [fit.rms_px for fit in fits[1:] if not _same_drawing(best.model, fit.model, renders)]
     next_px = min(others, default=math.inf)
@@ -214,78 +240,158 @@ def learn_engine(renders: Sequence[Render]) -> LearnedEngine:
 
 def residuals_px(model: EngineModel, render: Render) -> FloatArray:
     """Model minus seen corners (N, 2) px of one render; NaN where the model draws nothing."""
-    pose = render.target.pose
-    if pose is None:
-        raise InvalidInput("target", render.target.kind.value, "learning an engine needs a posed target")
-    world = target_points_world(pose, render.target.points_m()[render.detection.point_ids])
     drawn = model.drawn(render.asked)
-    rays = rays_of(world_to_camera(render.camera_pose, drawn.lens.nodal_offset_mm, world))
+    rays = rays_of(world_to_camera(render.camera_pose, drawn.lens.nodal_offset_mm, _world(render)))
     return np.asarray(drawn.project(rays) - render.detection.points_px)
 
 
-def _fitted(renders: Sequence[Render], direction: Direction, power: int, noise_px: float) -> LearnedEngine:
-    far = float(renders[0].asked.image_size[0])
-    scales = np.array([1e-2, 0.1, 0.1, 0.1, 0.1, 10.0, 10.0, 0.5])
+class _Corners:
+    """All corners of all renders in one row each, for fast trials of models: the same drawing as
+    :meth:`calibration.solve.engine_model.EngineModel.drawn`, in half widths."""
+
+    def __init__(self, renders: Sequence[Render]) -> None:
+        first = renders[0].asked
+        self.half_width_px = first.image_size[0] / 2
+        self.centre = (np.asarray(first.image_size, dtype=np.float64) - 1) / 2
+        self.aspect = first.pixel_aspect
+        parts = [
+            world_to_camera(r.camera_pose, 0.0, _world(r))[:, :3] for r in renders
+        ]  # before the pupil moves along the axis
+        self.points_m = np.concatenate(parts)
+        self.seen_px = np.concatenate([r.detection.points_px for r in renders])
+        counts = [len(part) for part in parts]
+
+        def each(value: Callable[[Lens], float]) -> FloatArray:
+            return np.repeat([value(r.asked) for r in renders], counts)
+
+        self.f_hw = each(lambda lens: lens.f_px) / self.half_width_px
+        self.k1_hw, self.k2_hw = each(lambda lens: lens.k1_hw), each(lambda lens: lens.k2_hw)
+        self.shift = np.column_stack(
+            [each(lambda lens: lens.center_shift_px[0]), each(lambda lens: lens.center_shift_px[1])]
+        )
+        self.nodal_mm = each(lambda lens: lens.nodal_offset_mm)
+
+    def misses(self, model: EngineModel) -> FloatArray:
+        """Model minus seen (M, 2) px; the picture's width where the model draws nothing."""
+        depth = self.points_m[:, 2] - model.nodal_gain * self.nodal_mm / 1000
+        f_hw = self.f_hw * model.focal_gain
+        flat = self.points_m[:, :2] / np.where(depth > 0, depth, np.nan)[:, None] * f_hw[:, None]
+        q = self.f_hw ** (2 * model.unit_power)
+        k1, k2 = model.k1_gain * self.k1_hw * q, model.k2_gain * self.k2_hw * q * q
+        radius = np.sqrt(np.sum(flat * flat, axis=1))
+        scale = _bent(radius, k1, k2, model.direction)
+        aspect = np.array([1.0, self.aspect * model.aspect_gain])
+        shift = np.asarray(model.shift_gain) * self.shift + np.asarray(model.shift_offset_px)
+        off = flat * scale[:, None] * aspect * self.half_width_px + self.centre + shift - self.seen_px
+        far = 2 * self.half_width_px
+        return np.clip(np.where(np.isfinite(off), off, far), -10 * far, 10 * far)
+
+
+def _bent(radius: FloatArray, k1: FloatArray, k2: FloatArray, direction: Direction) -> FloatArray:
+    """Distorted over undistorted radius (M,), half widths; NaN beyond the fold."""
+    if direction is Direction.FORWARD:
+        r2 = radius * radius
+        return np.where(1 + r2 * (3 * k1 + 5 * k2 * r2) > 0, 1 + r2 * (k1 + k2 * r2), np.nan)
+    r_d = radius.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(_REVERSE_STEPS):
+            r2 = r_d * r_d
+            r_d = r_d - (r_d * (1 + r2 * (k1 + k2 * r2)) - radius) / (1 + r2 * (3 * k1 + 5 * k2 * r2))
+        r2 = r_d * r_d
+        solved = np.abs(r_d * (1 + r2 * (k1 + k2 * r2)) - radius) < 1e-9 * (1 + radius)
+        solved &= (r_d >= 0) & (1 + r2 * (3 * k1 + 5 * k2 * r2) > 0)
+        return np.where(solved, np.divide(r_d, radius, out=np.ones_like(radius), where=radius > 0), np.nan)
+
+
+def _world(render: Render) -> FloatArray:
+    pose = render.target.pose
+    if pose is None:
+        raise InvalidInput("target", render.target.kind.value, "learning an engine needs a posed target")
+    return target_points_world(pose, render.target.points_m()[render.detection.point_ids])
+
+
+def _fitted(
+    corners: _Corners, renders: Sequence[Render], direction: Direction, power: int, noise_px: float
+) -> LearnedEngine:
+    """One kind of model fitted to the corners, its gains of k1 and k2 counted at the first render's focal length."""
     origin = renders[0].asked.center_shift_px
-    q = (2 * renders[0].asked.f_px / far) ** (2 * power)
+    q = float(corners.f_hw[0]) ** (2 * power)
 
     def model_of(x: FloatArray) -> EngineModel:
+        values = [float(value) for value in x]
         return EngineModel(
-            direction, power, math.exp(x[0]), x[1] / q, x[2] / q**2, (x[3], x[4]), (x[5], x[6]), x[7]
-        )  # fmt: skip
+            direction,
+            power,
+            focal_gain=math.exp(values[0]),
+            k1_gain=values[1] / q,
+            k2_gain=values[2] / q**2,
+            shift_gain=(values[3], values[4]),
+            shift_offset_px=(values[5], values[6]),
+            nodal_gain=values[7],
+            aspect_gain=math.exp(values[8]),
+        )
 
     def misses(x: FloatArray) -> FloatArray:
-        model = model_of(x)
-        off = np.concatenate([residuals_px(model, render) for render in renders])
-        return np.where(np.isfinite(off), off, far).ravel()
+        return corners.misses(model_of(np.clip(x, -_FARTHEST, _FARTHEST))).ravel()
 
-    best: tuple[float, FloatArray, FloatArray] | None = None
+    best: OptimizeResult | None = None
     for sign in (1.0, -1.0):
         # A mirrored shift with an origin far from the middle: the offset starts where the first render is right.
-        start = np.array([0.0, 0.0, 0.0, sign, sign, -sign * origin[0], -sign * origin[1], 1.0])
-        try:
-            found = least_squares(misses, start, x_scale=scales, method="trf", loss="linear", max_nfev=80)
-        except (ValueError, CalibrationError):
-            continue
-        if best is None or found.cost < best[0]:
-            best = float(found.cost), np.asarray(found.x), np.asarray(found.jac)
+        start = np.array([0.0, 0.0, 0.0, sign, sign, -sign * origin[0], -sign * origin[1], 1.0, 0.0])
+        found = least_squares(misses, start, x_scale=_SCALES, method="trf", max_nfev=60)
+        if best is None or found.cost < best.cost:
+            best = found
+        if math.sqrt(2 * best.cost / best.fun.size) < TRUSTED_SIGMAS * noise_px:
+            break
     if best is None:
-        return _not_understood("no fit", len(renders))
-    cost, x, jacobian = best
-    count = sum(2 * len(render.detection.points_px) for render in renders)
-    rms_px = math.sqrt(2 * cost / count)
+        raise NotConverged("the engine's model", 0, math.inf)  # two starts were made
+    rms_px = math.sqrt(2 * float(best.cost) / best.fun.size)
+    jacobian = np.asarray(best.jac)
+    strength = np.sqrt(np.sum(jacobian**2, axis=0))
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(rms_px, noise_px) ** 2
-    model = model_of(x)
-    natural = np.array([model.focal_gain, 1 / q, 1 / q**2, 1.0, 1.0, 1.0, 1.0, 1.0])
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * natural
+    model = model_of(np.asarray(best.x))
+    natural = np.array([model.focal_gain, 1 / q, 1 / q**2, 1.0, 1.0, 1.0, 1.0, 1.0, model.aspect_gain])
+    sigma = np.where(strength * _SCALES > _UNSEEN_PX, np.sqrt(np.maximum(np.diag(covariance), 0.0)) * natural, np.inf)
+    if not math.isfinite(sigma[7]):
+        model = replace(model, nodal_gain=1.0)
     return LearnedEngine(model, False, rms_px, math.inf, noise_px, len(renders), sigma=tuple(sigma.tolist()))
 
 
 def _snapped(fit: LearnedEngine, renders: Sequence[Render]) -> LearnedEngine:
-    """``fit`` with its numbers at whole values (gains at plus or minus 1, offsets at 0 or half a pixel) where that
-    explains the renders as well."""
-    m, sigma = fit.model, fit.sigma
+    """``fit`` with its numbers at whole values (gains at plus or minus 1, k2's at the square of k1's, offsets at 0, the
+    picture's middle or half a pixel) where that explains the renders as well."""
+    m = fit.model
+    sigma = dict(zip(PARAMETERS, fit.sigma, strict=True))
 
-    def near(value: float, spread: float, candidates: tuple[float, ...], loose: float) -> float:
-        for candidate in candidates:
-            if abs(value - candidate) < max(min(SNAP_SIGMAS * spread, loose), 1e-9):
-                return candidate
-        return value
+    def near(name: str, value: float, candidates: Sequence[float], loose: float) -> float:
+        reach = min(SNAP_SIGMAS * sigma[name], loose)
+        return next((c for c in candidates if abs(value - c) <= max(reach, 1e-12)), value)
 
-    one = (1.0, -1.0)
-    gains = [
-        near(v, s, one, SNAP_LOOSE * 5)
-        for v, s in zip((m.focal_gain, m.k1_gain, m.k2_gain, *m.shift_gain), sigma, strict=False)
+    def gain(name: str, value: float) -> float:
+        return near(name, value, (1.0, -1.0), SNAP_LOOSE)
+
+    k1 = gain("k1_gain", m.k1_gain)
+    squares = (1.0, -1.0, k1 * k1, -k1 * k1)
+    middle = [(size - 1) / 2 for size in renders[0].asked.image_size]
+    offsets = [
+        near(
+            f"shift_offset_{axis}_px",
+            m.shift_offset_px[i],
+            [sign * middle[i] + half for sign in (0.0, 1.0, -1.0) for half in (0.0, 0.5, -0.5)],
+            _SNAP_PX,
+        )
+        for i, axis in enumerate("xy")
     ]
-    width, height = renders[0].asked.image_size
-    offsets = []
-    for axis, size in enumerate((width, height)):
-        whole = [sign * (size - 1) / 2 + half for sign in (0.0, 1.0, -1.0) for half in (0.0, 0.5, -0.5)]
-        offsets.append(near(m.shift_offset_px[axis], sigma[5 + axis], tuple(whole), 0.1))
-    snapped = EngineModel(
-        m.direction, m.unit_power, gains[0], gains[1], gains[2], (gains[3], gains[4]), (offsets[0], offsets[1]),
-        near(m.nodal_gain, sigma[7], one, 0.05),
-    )  # fmt: skip
+    snapped = replace(
+        m,
+        focal_gain=gain("focal_gain", m.focal_gain),
+        k1_gain=k1,
+        k2_gain=near("k2_gain", m.k2_gain, squares, SNAP_LOOSE * max(1.0, k1 * k1)),
+        shift_gain=(gain("shift_gain_x", m.shift_gain[0]), gain("shift_gain_y", m.shift_gain[1])),
+        shift_offset_px=(offsets[0], offsets[1]),
+        nodal_gain=near("nodal_gain", m.nodal_gain, _NODAL_GAINS, _SNAP_NODAL * abs(m.nodal_gain)),
+        aspect_gain=near("aspect_gain", m.aspect_gain, (1.0,), SNAP_LOOSE),
+    )
     off = np.concatenate([residuals_px(snapped, render) for render in renders])
     rms_px = float(np.sqrt(np.mean(off**2))) if np.isfinite(off).all() else math.inf
     if rms_px > max(1.2 * fit.rms_px, fit.rms_px + fit.noise_px / 4):

@@ -7,6 +7,7 @@ identity:
     f_drawn = focal_gain f                                                     (overscan, another FoV axis)
     k1_hw,drawn = k1_gain k1_hw q,  k2_hw,drawn = k2_gain k2_hw q^2,  q = (f / (W/2))^(2 unit_power)
     shift_drawn = shift_gain shift + shift_offset_px,   nodal_drawn = nodal_gain nodal
+    aspect_drawn = aspect_gain aspect                                          (of the pixels; no value changes it)
 
 with the distortion's radius 1 at half the picture's width. ``unit_power`` is 0 where profile and engine count the
 radius in units that stay in proportion when the lens zooms, +1 where the profile says focal lengths and the engine
@@ -73,6 +74,7 @@ class EngineModel:
     shift_gain: tuple[float, float] = (1.0, 1.0)
     shift_offset_px: tuple[float, float] = (0.0, 0.0)
     nodal_gain: float = 1.0
+    aspect_gain: float = 1.0
 
     def drawn(self, asked: Lens) -> DrawnLens:
         """What the engine draws when ``asked`` is set."""

@@ -13,14 +13,7 @@ from typing import Self
 
 from engine_adapters.errors import ProtocolError, UnsafeText
 from engine_adapters.ports import LensValues, Shown, TrackedCamera
-from engine_adapters.profile import (
-    REVERSE_NOT_AVAILABLE,
-    EngineSettings,
-    PictureSettings,
-    ProfileError,
-    R3Settings,
-    StudioProfile,
-)
+from engine_adapters.profile import EngineSettings, PictureSettings, R3Settings, StudioProfile
 from engine_adapters.r3.commands import number_text
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -53,10 +46,9 @@ class EngineMapping:
     def lens_to_engine(self, values: LensValues) -> tuple[tuple[str, str], ...]:
         """(export name, value text) pairs that set a lens.
 
-        Raises ``UnsafeText`` for a lens that cannot be sent (field of view outside 0..180 degrees, NaN), and
-        ``ProfileError`` for a polynomial that goes the other way.
+        k1 and k2 are those of the engine's own polynomial, whichever way it goes: only their unit is converted.
+        Raises ``UnsafeText`` for a lens that cannot be sent (field of view outside 0..180 degrees, NaN).
         """
-        self._refuse_reverse()
         if not 0.0 < values.fov_x_deg < 180.0:
             raise UnsafeText(f"fov_x_deg = {values.fov_x_deg}: must be between 0 and 180 degrees")
         f_px = self._f_px(math.radians(values.fov_x_deg))
@@ -76,7 +68,6 @@ class EngineMapping:
 
     def lens_from_engine(self, exports: Mapping[str, str]) -> LensValues:
         """The lens that the engine's values tell. Raises ``ProtocolError`` for a value that is no lens."""
-        self._refuse_reverse()
         names = self.r3.exports
         fov_x = self._fov_from_engine(_read_number(exports, names.fov_x), names.fov_x)
         f_px = self._f_px(fov_x)
@@ -117,10 +108,6 @@ class EngineMapping:
             fov_x_deg=packet.get("FOVX"),
             fov_y_deg=packet.get("FOVY"),
         )
-
-    def _refuse_reverse(self) -> None:
-        if self.engine.direction == "reverse":
-            raise ProfileError(REVERSE_NOT_AVAILABLE, where="studio profile")
 
     def _f_px(self, fov_x: float) -> float:
         """Horizontal focal length, pixels, of a horizontal field of view in radians."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 from datetime import UTC, datetime
 from typing import Any, get_args
@@ -15,6 +16,8 @@ from pydantic import ValidationError
 from app import events
 from app.errors import TooManyListeners
 from calibration.lens import Lens
+from calibration.solve.engine_learning import LearnedEngine
+from calibration.solve.engine_model import EngineModel
 from calibration.tables import Frames, LevelResult, PixelError
 from storage.records import EventRecord
 
@@ -42,6 +45,9 @@ SAMPLES: list[events.AnyEvent] = [
     events.LevelProgress(**PLACE, progress=0.5),
     events.LevelDone.of(2, RESULT),
     events.LevelFailed(**PLACE, reason="the picture did not change"),
+    events.EngineLearned.of(
+        "default", LearnedEngine(EngineModel(), True, 0.004, math.inf, 0.02, 8), ("engine.direction says a, not b",)
+    ),
     events.EngineRestored(engine="default"),
     events.EngineDirty(engine="default", reason="the engine is gone"),
     events.JobDone(table_id=7),

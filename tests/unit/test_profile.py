@@ -155,14 +155,12 @@ def test_a_file_is_read_with_its_name_in_every_error(tmp_path: Path) -> None:
 def test_what_is_not_available_yet_says_so() -> None:
     require_available(StudioProfile())
     profile = StudioProfile(
-        engine=EngineSettings(direction="reverse"),
         head=HeadSettings(kind="visca"),
         tracking=TrackingSettings(kind="freed"),
     )
     with pytest.raises(ProfileError) as caught:
         require_available(profile)
     assert [problem.split(" ")[0] for problem in caught.value.problems] == [
-        "engine.direction",
         "head.kind",
         "tracking.kind",
     ]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from engine_adapters.errors import ProtocolError, UnsafeText
 from engine_adapters.ports import LensValues, Shown
-from engine_adapters.profile import EngineSettings, PictureSettings, ProfileError, R3Settings, StudioProfile
+from engine_adapters.profile import EngineSettings, PictureSettings, R3Settings, StudioProfile
 from engine_adapters.r3.mapping import EngineMapping
 
 # docs: conventions.md and protocols/README.md, "Test vector".
@@ -153,12 +153,14 @@ def test_there_and_back_is_the_same_lens(
     assert back.nodal_offset_mm == pytest.approx(nodal, rel=1e-12, abs=1e-300)
 
 
-def test_a_reverse_polynomial_is_refused_both_ways() -> None:
-    converter = mapping(direction="reverse")
-    with pytest.raises(ProfileError, match=r"needs the engine learned.*not available yet"):
-        converter.lens_to_engine(GOLDEN)
-    with pytest.raises(ProfileError, match="not available yet"):
-        converter.lens_from_engine({})
+def test_a_reverse_polynomial_keeps_its_own_coefficients() -> None:
+    """Which way a polynomial goes is the learned engine's business; here only the unit of its radius counts."""
+    values = dict(mapping(direction="reverse", radius_unit="half_width").lens_to_engine(GOLDEN))
+    forward = dict(mapping(radius_unit="half_width").lens_to_engine(GOLDEN))
+    assert values == forward
+    assert mapping(direction="reverse", radius_unit="half_width").lens_from_engine(values).k1 == pytest.approx(
+        GOLDEN.k1
+    )
 
 
 @pytest.mark.parametrize("fov_x_deg", [0.0, -1.0, 180.0, math.nan, math.inf])
