@@ -1,8 +1,9 @@
 """The iteration of a level's fit: damped Gauss-Newton, robust start, noise floor, outliers, and what it leaves.
 
-Levenberg-Marquardt damping on whitened residuals. The variance of a point is its detection's covariance plus one
-common floor (``floor_px``) for what the model does not describe (a board that is not flat, an edge that is not
-straight): the floor is chosen so that chi2 equals the degrees of freedom (variance component estimation), so that
+Levenberg-Marquardt damping on whitened residuals; the unknowns of single pictures are eliminated from the normal
+equations, so that many pictures cost little more than few. The variance of a point is its detection's covariance plus
+one common floor (``floor_px``) for what the model does not describe (an edge that is not straight, a sharpened
+photograph): the floor is chosen so that chi2 equals the degrees of freedom (variance component estimation), so that
 uncertainties stay true where the detector's own are too small to be.
 """
 
@@ -17,8 +18,19 @@ from numpy.typing import NDArray
 
 from calibration.errors import NotConverged, NotEnoughData
 from calibration.lens import Lens
-from calibration.solve.problem import LENS_COUNT, PRIOR_NODAL_MM, Evaluation, Problem, State, View
-from calibration.solve.start import FreePoses
+from calibration.solve.mistakes import Mistake, Priors
+from calibration.solve.normal import NormalEquations
+from calibration.solve.problem import (
+    LENS_COUNT,
+    OWN,
+    PRIOR_NODAL_MM,
+    Evaluation,
+    FreePoses,
+    Problem,
+    State,
+    View,
+)
+from calibration.solve.rotation import rotation_log
 from calibration.types import FloatArray
 
 _ITERATIONS = 200
@@ -30,6 +42,8 @@ _OUTLIER_CHI2 = 25.0
 _VIEW_OUTLIERS = 0.3
 # A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
 _FLOOR_ROUNDS = 6
+_PLACE = ("place across", "place in depth", "height")
+_TURN = ("turn about its columns", "turn about its rows", "turn in its plane")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +72,7 @@ class LevelFit:
     ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
     pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
     stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
+    ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns with priors.
     """
 
     lens: Lens
@@ -73,6 +88,7 @@ class LevelFit:
     iterations: int
     untold: tuple[str, ...] = ()
     sigma_nodal_mm: float | None = None
+    mistakes: tuple[Mistake, ...] = ()
     nodal_told: bool = False
     nodal_seen_mm: tuple[float, float] | None = None
 
@@ -100,17 +116,24 @@ class Fit:
         lens_free: bool = True,
         held: tuple[str, ...] = (),
         nodal_sigma_mm: float = PRIOR_NODAL_MM,
+        priors: Priors | None = None,
     ) -> None:
-        self.problem = Problem(views, lens, poses, lens_free=lens_free, held=held, nodal_sigma_mm=nodal_sigma_mm)
+        self.problem = Problem(
+            views, lens, poses, lens_free=lens_free, held=held, nodal_sigma_mm=nodal_sigma_mm, priors=priors
+        )
         self.state: State = self.problem.state
         self.detector_px2 = np.concatenate([v.detection.covariance_px2 for v in views])
         self.used = np.ones(len(self.detector_px2), dtype=bool)
         self.floor_px = 0.0
         self.iterations = 0
+        ends = np.cumsum([len(v.detection.points_px) for v in views])
+        self._rows = [
+            slice(int(end) - len(v.detection.points_px), int(end)) for v, end in zip(views, ends, strict=True)
+        ]
 
     def free_poses(self) -> FreePoses:
         """The poses that were free, as they now stand."""
-        return {index: (pose.R_ct, pose.t_ct_m) for index, pose in self.state.free.items()}
+        return {int(i): (self.state.R[i], self.state.t[i]) for i in np.flatnonzero(self.problem.own_count == OWN)}
 
     def run(self) -> None:
         """Robust start, then rounds of: floor from the residuals, outliers by it, fit."""
@@ -118,7 +141,7 @@ class Fit:
         self.iterate(robust=True)
         for _ in range(_FLOOR_ROUNDS):
             before = self.floor_px, self.used.copy()
-            residual = self.problem.evaluate(self.state, jacobian=False).residual_px
+            residual = self.problem.residuals(self.state)
             self.floor_px = self._robust_floor(residual)
             self._reject(residual)
             self.iterate(robust=False)
@@ -138,13 +161,10 @@ class Fit:
         moved = math.inf
         for _ in range(_ITERATIONS):
             self.iterations += 1
-            matrix, gradient = self._normal_equations(evaluation, whiten, robust)
+            normal = self._normal(evaluation, whiten, robust)
             for _ in range(12):
-                scale = np.diag(matrix).copy()
-                scale[scale <= 0] = 1.0
-                try:
-                    step = np.asarray(np.linalg.solve(matrix + damping * np.diag(scale), -gradient), dtype=np.float64)
-                except np.linalg.LinAlgError:
+                step = normal.solved(damping)
+                if step is None:
                     damping = max(damping, 1e-6) * 10
                     continue
                 trial = self.problem.stepped(self.state, step)
@@ -180,26 +200,22 @@ class Fit:
         whitened = np.where(self.used[:, None], whitened, 0.0)
         squares = np.sum(whitened**2, axis=1)
         data = float(np.sum(4.0 * np.log1p(squares / 4.0))) if robust else float(np.sum(squares))
-        return data + float(np.sum(evaluation.prior_residual**2))
+        priors = float(np.sum(evaluation.prior_residual**2)) + float(np.sum(evaluation.own_prior_residual**2))
+        return data + priors
 
-    def _normal_equations(
-        self, evaluation: Evaluation, whiten: FloatArray, robust: bool
-    ) -> tuple[FloatArray, FloatArray]:
-        whitened = (whiten @ evaluation.residual_px[..., None])[..., 0][self.used]
-        J = (whiten @ evaluation.jacobian)[self.used]
+    def _normal(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> NormalEquations:
+        used = self.used[:, None]
+        whitened = np.where(used, (whiten @ evaluation.residual_px[..., None])[..., 0], 0.0)
         if robust:
             root = np.sqrt(self._robust_weights(whitened))
-            whitened, J = whitened * root[:, None], J * root[:, None, None]
-        flat = J.reshape(-1, J.shape[-1])
-        prior = evaluation.prior_jacobian
-        matrix = flat.T @ flat + prior.T @ prior
-        return matrix, flat.T @ whitened.ravel() + prior.T @ evaluation.prior_residual
+            whitened, whiten = whitened * root[:, None], whiten * root[:, None, None]
+        shared = np.where(used[..., None], whiten @ evaluation.shared, 0.0)
+        own = np.where(used[..., None], whiten @ evaluation.own, 0.0) if self.problem.own_count.any() else None
+        return NormalEquations.of(self._rows, self.problem.own_count, evaluation, whitened, shared, own)
 
     def _degrees_of_freedom(self) -> int:
         # Unknowns with a prior bring one observation each, so they take nothing from the points.
-        priors = self.problem.evaluate(self.state, jacobian=False).prior_residual.size
-        with_prior = priors - self.problem.weak_priors
-        return max(2 * int(self.used.sum()) - (self.problem.count - with_prior), 1)
+        return max(2 * int(self.used.sum()) - (self.problem.count - self.problem.prior_count), 1)
 
     def _robust_floor(self, residual: FloatArray) -> float:
         """The floor that explains the residuals but for gross errors.
@@ -218,7 +234,7 @@ class Fit:
 
     def _floor_for_chi2(self) -> float:
         """The floor at which chi2 equals the degrees of freedom (0 if it is below them without one); bisection."""
-        residual = self.problem.evaluate(self.state, jacobian=False).residual_px[self.used]
+        residual = self.problem.residuals(self.state)[self.used]
         covariance = self.detector_px2[self.used]
         goal = self._degrees_of_freedom()
 
@@ -247,7 +263,7 @@ class Fit:
 
     def worst_view(self) -> tuple[int, str] | None:
         """(index, reason) of the picture with most outliers, if it is to be dropped."""
-        residual = self.problem.evaluate(self.state, jacobian=False).residual_px
+        residual = self.problem.residuals(self.state)
         worst: tuple[int, float] | None = None
         for index in range(len(self.problem.views)):
             share = 1 - float(np.mean(self.used[self.problem.view_of == index]))
@@ -261,9 +277,8 @@ class Fit:
     def result(self, dropped: tuple[tuple[str, str], ...]) -> LevelFit:
         evaluation = self.problem.evaluate(self.state)
         whiten = self._whitening()
-        matrix, _ = self._normal_equations(evaluation, whiten, False)
         lens = self.state.lens
-        inverse = _inverse(matrix)
+        inverse = self._normal(evaluation, whiten, False).shared_covariance()
         covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
         column = self.problem.nodal_column
         residual = evaluation.residual_px
@@ -299,16 +314,40 @@ class Fit:
             views=tuple(views),
             outliers=tuple(outliers),
             dropped=dropped,
-            poses={self.problem.views[i].name: (p.R_ct, p.t_ct_m) for i, p in self.state.free.items()},
+            poses={self.problem.views[i].name: pose for i, pose in self.free_poses().items()},
             iterations=self.iterations,
             sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
+            mistakes=self._mistakes(inverse),
         )
 
+    def _mistakes(self, covariance: FloatArray) -> tuple[Mistake, ...]:
+        """What became of each mistake that was an unknown; ``covariance`` of the shared unknowns."""
+        problem, state, geometry = self.problem, self.state, self.problem.geometry
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        found: list[Mistake] = []
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of the normal matrix (P, P), its columns first scaled to like size: pixels stand beside millimetres."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    return np.asarray(np.linalg.pinv(matrix * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
+        def add(
+            first: int, names: Sequence[str], subject: str, unit: str, off: FloatArray, prior: float, per: float = 1.0
+        ) -> None:
+            for i, name in enumerate(names):
+                spread = float(sigma[first + i]) * per
+                found.append(Mistake(name, subject, unit, float(off[i]) * per, spread, prior * per))
+
+        for index, prior in enumerate(geometry.pivot_sigmas_m):
+            off = state.pivots[index] - geometry.pivots_m[index]
+            add(problem.first_pivot + 3 * index, _PLACE, "pivot", "mm", off, float(prior), 1000.0)
+        for index, prior in enumerate(geometry.place_sigmas_m):
+            off = state.places[index] - geometry.places_m[index]
+            add(problem.first_place + 3 * index, _PLACE, geometry.place_names[index], "mm", off, float(prior), 1000.0)
+        for index, prior in enumerate(geometry.turn_sigmas_rad):
+            off = rotation_log(geometry.turns[index].T @ state.turns[index])
+            first, name = problem.first_turn + 3 * index, geometry.turn_names[index]
+            add(first, _TURN, name, "deg", off, float(prior), math.degrees(1.0))
+        extras = problem.extras
+        for index, name in enumerate(extras.names):
+            subject, unit, prior = extras.subjects[index], extras.units[index], float(extras.sigmas[index])
+            add(problem.first_extra + index, [name], subject, unit, state.extras[index : index + 1], prior)
+        return tuple(found)
 
 
 def _to_lens_parameters(lens: Lens, covariance: FloatArray) -> FloatArray:

@@ -169,7 +169,7 @@ def residual_of(view: View, lens: Lens) -> FloatArray | None:
         fitted = Fit([view], lens, poses, lens_free=False)
         if fitted.problem.count:
             fitted.iterate(robust=False)
-        residual = fitted.problem.evaluate(fitted.state, jacobian=False).residual_px
+        residual = fitted.problem.residuals(fitted.state)
     except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
         return None
     return residual if np.isfinite(residual).all() else None

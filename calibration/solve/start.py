@@ -11,14 +11,12 @@ import numpy as np
 from calibration.camera import rays_of, target_points_world, world_to_camera
 from calibration.errors import NotEnoughData
 from calibration.lens import Lens
-from calibration.solve.problem import View
+from calibration.solve.problem import FreePoses, View
 from calibration.types import FloatArray
 
 _FOVS_DEG = (120.0, 95.0, 75.0, 60.0, 48.0, 38.0, 30.0, 22.0, 15.0, 9.0, 5.0, 3.0)
 _K1_HW = (-0.15, -0.05, 0.0, 0.05)
 # Coarse steps over all lenses that make pictures: the iteration converges from the nearest by far.
-
-FreePoses = dict[int, tuple[FloatArray, FloatArray]]
 
 
 def start(
