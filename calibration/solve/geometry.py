@@ -1,30 +1,55 @@
 """Where every point of every picture of a level lies in its camera's axes, and how that moves with the unknowns.
 
 Posed pictures: X_c = E^T R(pan', tilt', roll')^T (place + R_wt q - pivot) - pupil, with the encoders' mistakes
-pan' = (1 + pan_scale) pan + pan_offset, and so on, E the picture's own small turn, and q the target's point, which a
-bowed board lifts out of its plane: q_z = bow_x (1 - (2 x / w)^2) + bow_y (1 - (2 y / h)^2) (as mrcal's
-calobject_warp). Free pictures: X_c = R q + t.
+pan' = (1 + pan_scale) pan + pan_offset, and so on, E the picture's own small turn, and q the target's point. Free
+pictures: X_c = R q + t. A board that is not flat lifts its points out of their plane by a few smooth shapes of x, y in
+-1..1 over its corners (:data:`SHAPES`); the first two are mrcal's calobject_warp.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.camera import camera_rotation, target_rotation
+from calibration.camera import target_rotation
 from calibration.solve.mistakes import HAND_HELD_BOW, Priors
-from calibration.types import CameraPose, FloatArray, IntArray, TargetKind
+from calibration.solve.rotation import cross
+from calibration.types import CameraPose, FloatArray, IntArray, Target, TargetKind
 
 if TYPE_CHECKING:
     from calibration.solve.problem import FreePoses, State, View
 
+SHAPES: dict[str, Callable[[FloatArray, FloatArray], FloatArray]] = {
+    "bow along columns": lambda x, y: 1 - x * x,
+    "bow along rows": lambda x, y: 1 - y * y,
+    "twist": lambda x, y: x * y,
+    "shape x^3": lambda x, y: x**3 - x,
+    "shape y^3": lambda x, y: y**3 - y,
+    "shape x^2 y": lambda x, y: x * x * y - y,
+    "shape x y^2": lambda x, y: x * y * y - x,
+    "shape x^4": lambda x, y: x**4 - x * x,
+    "shape y^4": lambda x, y: y**4 - y * y,
+    "shape x^2 y^2": lambda x, y: x * x * y * y,
+}
+"""How a board may stand out of its plane, by name; the offsets and slopes that a pose would take up are left out."""
+_BOWS = 2
+_HIGHER_SHARE = 0.3
+# Prior of the higher shapes, as a share of the bow's.
+_HIGHER_FROM_PICTURES = 5
 _PAN, _TILT, _ROLL = 0, 1, 2
 _BOW_POINTS = 12
 # A target with fewer points (a square has four) does not show its own bow.
+
+
+def shape_m(target: Target, name: str, size_mm: float) -> FloatArray:
+    """How far (m) a shape of ``size_mm`` lifts each of a target's points, (N,)."""
+    points = target.points_m()
+    x, y = (points / np.maximum(np.abs(points).max(axis=0), 1e-12)).T
+    return np.asarray(0.001 * size_mm * SHAPES[name](x, y))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,12 +77,23 @@ class PosedPoints:
 class Geometry:
     """The constant part: points, nominal poses, priors, which unknown belongs to which picture."""
 
-    def __init__(self, views: Sequence[View], priors: Priors, *, shared_free: bool) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        priors: Priors,
+        *,
+        shared_free: bool,
+        lifted: Mapping[str, FloatArray] | None = None,
+    ) -> None:
+        """``lifted``: by target, how far (m) each of its points stands out of its plane, where that is known."""
         self._views = views
         counts = [len(v.detection.points_px) for v in views]
         self.view_of: IntArray = np.repeat(np.arange(len(views), dtype=np.int64), counts)
         plane = np.concatenate([v.target.points_m()[v.detection.point_ids] for v in views])
-        self._q = np.column_stack([plane, np.zeros(len(plane))])
+        known = lifted or {}
+        lift = [known[v.target_name][v.detection.point_ids] if v.target_name in known else np.zeros(n)
+                for v, n in zip(views, counts, strict=True)]  # fmt: skip
+        self._q = np.column_stack([plane, np.concatenate(lift)])
         free = np.array([v.free for v in views])
         self.posed = ~free[self.view_of]
         self._free_view = free
@@ -70,7 +106,7 @@ class Geometry:
         self._group_pivots(poses, free, shared_free)
         self._group_targets(free, shared_free)
         self.extras = self._extras(priors, free) if shared_free else Extras((), (), (), np.zeros(0))
-        self._lift = self._bow_shapes()
+        self._lift = self._board_shapes()
 
     def _turn_sigmas(self, sigmas_deg: FloatArray, turned: FloatArray) -> FloatArray:
         """(V, 3, 3): rotation vector in camera axes over its sigmas. Tilt turns about the camera's x, pan about its y
@@ -134,7 +170,10 @@ class Geometry:
             if sigma is None:
                 sigma = HAND_HELD_BOW * max(target.outline_m()) if hand_held else 0.0
             if sigma > 0:
-                found += [(f"bow along {way}", name, "mm", 1000 * sigma) for way in ("columns", "rows")]
+                found += [(shape, name, "mm", 1000 * sigma) for shape in [*SHAPES][:_BOWS]]
+                if hand_held and pictures >= _HIGHER_FROM_PICTURES:
+                    higher = _HIGHER_SHARE * 1000 * sigma
+                    found += [(shape, name, "mm", higher) for shape in [*SHAPES][_BOWS:]]
         if not free.all():
             for axis, scale, offset in (("pan", priors.pan_scale, priors.pan_offset_deg),
                                         ("tilt", priors.tilt_scale, priors.tilt_offset_deg)):  # fmt: skip
@@ -146,21 +185,29 @@ class Geometry:
         names, subjects, units, sigmas = zip(*found, strict=True) if found else ((), (), (), ())
         return Extras(tuple(names), tuple(subjects), tuple(units), np.array(sigmas, dtype=np.float64))
 
-    def _bow_shapes(self) -> dict[int, FloatArray]:
-        """For each bow, how far (m for each mm) it lifts every point, (N,)."""
+    def _board_shapes(self) -> dict[int, FloatArray]:
+        """For each shape of a board, how far (m for each mm) it lifts every point, (N,)."""
         shapes: dict[int, FloatArray] = {}
         for index, (name, subject) in enumerate(zip(self.extras.names, self.extras.subjects, strict=True)):
-            if not name.startswith("bow"):
+            if name not in SHAPES:
                 continue
-            axis = 0 if name.endswith("columns") else 1
             lift = np.zeros(len(self._q))
             for number, view in enumerate(self._views):
                 if view.target_name == subject:
-                    rows = self.view_of == number
-                    half = max(float(np.abs(view.target.points_m()[:, axis]).max()), 1e-12)
-                    lift[rows] = 0.001 * (1 - (self._q[rows, axis] / half) ** 2)
+                    shape = shape_m(view.target, name, 1.0)
+                    lift[self.view_of == number] = shape[view.detection.point_ids]
             shapes[index] = lift
         return shapes
+
+    def lifted(self, state: State) -> dict[str, FloatArray]:
+        """By target, how far (m) each of its points stands out of its plane, as the state has it."""
+        found: dict[str, FloatArray] = {}
+        targets = {view.target_name: view.target for view in self._views}
+        for index in self._lift:
+            name, subject = self.extras.names[index], self.extras.subjects[index]
+            shape = shape_m(targets[subject], name, float(state.extras[index]))
+            found[subject] = found.get(subject, np.zeros(len(shape))) + shape
+        return found
 
     def first_own(self, free_poses: FreePoses) -> tuple[FloatArray, FloatArray]:
         """Where each picture's own pose starts."""
@@ -192,10 +239,14 @@ class Geometry:
         R_nominal, axes = self._nominal(state)
         R_cw = np.where(self._free_view[:, None, None], np.eye(3), np.swapaxes(R_nominal @ state.R, 1, 2))
         R_ct = np.where(self._free_view[:, None, None], state.R, R_cw @ R_wt)
-        from_pivot = centre[of] + np.einsum("nij,nj->ni", R_wt[of], q) - stand[of]
-        turned = np.where(
-            self.posed[:, None], np.einsum("nij,nj->ni", R_cw[of], from_pivot), np.einsum("nij,nj->ni", R_ct[of], q)
-        )
+        turned = np.einsum("nij,nj->ni", R_ct[of], q)
+        from_pivot = turned
+        if self.posed.any():
+            # R_ct q + R_cw (centre - stand) is the same for posed pictures, and needs no second turn of all points.
+            off = np.einsum("vij,vj->vi", R_cw, centre - stand)
+            turned = np.where(self.posed[:, None], turned + off[of], turned)
+            if self.extras.names:
+                from_pivot = np.einsum("nji,nj->ni", R_cw[of], turned)
         pupil = np.array([0.0, 0.0, state.lens.nodal_offset_mm / 1000.0])
         for way, column in (("right", 0), ("down", 1)):
             index = self._index(f"pupil off axis, {way}")
@@ -216,13 +267,17 @@ class Geometry:
         pan = self._angles_deg[:, 0] * (1 + self._extra(state, "pan scale")) + self._extra(state, "pan offset")
         tilt = self._angles_deg[:, 1] * (1 + self._extra(state, "tilt scale")) + self._extra(state, "tilt offset")
         roll = self._angles_deg[:, 2] + self._extra(state, "roll offset")
-        R = np.array([camera_rotation(*angles) for angles in zip(pan, tilt, roll, strict=True)])
         c, s = np.cos(np.radians(pan)), np.sin(np.radians(pan))
         ct, st = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+        cr, sr = np.cos(np.radians(roll)), np.sin(np.radians(roll))
         axes = np.zeros((len(pan), 3, 3))
         axes[:, _PAN, 2] = -1.0
         axes[:, _TILT, 0], axes[:, _TILT, 1] = c, -s
         axes[:, _ROLL, 0], axes[:, _ROLL, 1], axes[:, _ROLL, 2] = s * ct, c * ct, st
+        # Forward is the axis of roll; right and down are the tilt's axis and its normal, turned about it.
+        right, forward = axes[:, _TILT], axes[:, _ROLL]
+        up = cross(right, forward)
+        R = np.stack([cr[:, None] * right - sr[:, None] * up, -sr[:, None] * right - cr[:, None] * up, forward], axis=2)
         return R, axes
 
     def fill_shared(
@@ -248,7 +303,7 @@ class Geometry:
                 rows = self._turn_of[of] == number
                 column = turn + 3 * number
                 q = self._q[rows]
-                shared[rows, :, column : column + 3] = np.cross(q[:, None, :], in_target[rows])
+                shared[rows, :, column : column + 3] = cross(q[:, None, :], in_target[rows])
         for index, name in enumerate(self.extras.names):
             moved = self._moved_by(index, name, posed)
             shared[:, :, extra + index] = np.einsum("nij,nj->ni", per_point, moved)
@@ -256,7 +311,7 @@ class Geometry:
     def _moved_by(self, index: int, name: str, posed: PosedPoints) -> FloatArray:
         """d(points in camera axes, m) / d(one mistake), (N, 3)."""
         of = self.view_of
-        if name.startswith("bow"):
+        if name in SHAPES:
             return np.asarray(posed.R_ct[of][:, :, 2] * self._lift[index][:, None])
         if name.startswith("pupil"):
             moved = np.zeros_like(posed.points_m)
@@ -264,7 +319,7 @@ class Geometry:
             return moved
         which = {"pan": _PAN, "tilt": _TILT, "roll": _ROLL}[name.split(" ")[0]]
         # A turn of the camera by d about an axis moves the points by -d (axis x point).
-        by_angle = -np.cross(posed.axes[of, which], posed.from_pivot_m)
+        by_angle = -cross(posed.axes[of, which], posed.from_pivot_m)
         per_unit = math.radians(1.0) * (self._angles_deg[of, which] if name.endswith("scale") else 1.0)
         moved = np.einsum("nij,nj->ni", posed.R_cw[of], by_angle * np.reshape(per_unit, (-1, 1)))
         return np.where(self.posed[:, None], moved, 0.0)
@@ -272,10 +327,12 @@ class Geometry:
     def own_jacobian(self, per_point: FloatArray, posed: PosedPoints) -> FloatArray:
         """Derivatives (N, 2, 6) by each picture's own unknowns, zero where it has none."""
         own = np.zeros((len(per_point), 2, 6))
-        count = self.own_count[self.view_of]
-        free, turned = count == 6, count == 3
-        around = np.cross(posed.turned[:, None, :], per_point)
-        own[free, :, :3] = around[free]
-        own[free, :, 3:] = per_point[free]
-        own[turned, :, :3] = -around[turned]
+        if not self.own_count.any():
+            return own
+        count = self.own_count[self.view_of][:, None, None]
+        # A free pose turns its points, a camera's turn moves them the other way; a pose known exactly does neither.
+        own[..., :3] = cross(posed.turned[:, None, :], per_point) * np.select(
+            [count == 6, count == 3], [1.0, -1.0], 0.0
+        )
+        own[..., 3:] = per_point * (count == 6)
         return own

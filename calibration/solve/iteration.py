@@ -10,8 +10,8 @@ uncertainties stay true where the detector's own are too small to be.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,8 @@ _ITERATIONS = 200
 # Boards that all face the camera leave a valley along which the fit creeps; all else needs ten to twenty.
 _CONVERGED_PX = 1e-7
 # A step that moves no point by more than this is the end: five orders below the best detector.
+_ROUGH_PX = 1e-3
+# The same between the rounds in which floor and outliers are still sought.
 _OUTLIER_CHI2 = 25.0
 # Squared distance over its variance, 2 degrees of freedom: 5 sigma, one point in 270,000.
 _VIEW_OUTLIERS = 0.3
@@ -72,7 +74,7 @@ class LevelFit:
     ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
     pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
     stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
-    ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns with priors.
+    ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns with ``priors``.
     """
 
     lens: Lens
@@ -89,6 +91,7 @@ class LevelFit:
     untold: tuple[str, ...] = ()
     sigma_nodal_mm: float | None = None
     mistakes: tuple[Mistake, ...] = ()
+    priors: Priors = field(default_factory=Priors)
     nodal_told: bool = False
     nodal_seen_mm: tuple[float, float] | None = None
 
@@ -117,9 +120,18 @@ class Fit:
         held: tuple[str, ...] = (),
         nodal_sigma_mm: float = PRIOR_NODAL_MM,
         priors: Priors | None = None,
+        lifted: Mapping[str, FloatArray] | None = None,
     ) -> None:
+        self.priors = priors or Priors()
         self.problem = Problem(
-            views, lens, poses, lens_free=lens_free, held=held, nodal_sigma_mm=nodal_sigma_mm, priors=priors
+            views,
+            lens,
+            poses,
+            lens_free=lens_free,
+            held=held,
+            nodal_sigma_mm=nodal_sigma_mm,
+            priors=self.priors,
+            lifted=lifted,
         )
         self.state: State = self.problem.state
         self.detector_px2 = np.concatenate([v.detection.covariance_px2 for v in views])
@@ -135,22 +147,29 @@ class Fit:
         """The poses that were free, as they now stand."""
         return {int(i): (self.state.R[i], self.state.t[i]) for i in np.flatnonzero(self.problem.own_count == OWN)}
 
-    def run(self) -> None:
-        """Robust start, then rounds of: floor from the residuals, outliers by it, fit."""
-        self.floor_px = 1.0
-        self.iterate(robust=True)
+    def run(self, after: Fit | None = None) -> None:
+        """Robust start, then rounds of: floor from the residuals, outliers by it, fit.
+
+        ``after``: a fit of the same pictures that differs by a few unknowns; its floor and outliers are the start.
+        """
+        if after is None:
+            self.floor_px = 1.0
+            self.iterate(robust=True)
+        else:
+            self.floor_px, self.used = after.floor_px, after.used.copy()
+            self.iterate(robust=False, settled_px=_ROUGH_PX)
         for _ in range(_FLOOR_ROUNDS):
             before = self.floor_px, self.used.copy()
             residual = self.problem.residuals(self.state)
             self.floor_px = self._robust_floor(residual)
             self._reject(residual)
-            self.iterate(robust=False)
+            self.iterate(robust=False, settled_px=_ROUGH_PX)
             if abs(self.floor_px - before[0]) <= 0.01 * before[0] + 1e-6 and np.array_equal(self.used, before[1]):
                 break
         self.floor_px = self._floor_for_chi2()
         self.iterate(robust=False)
 
-    def iterate(self, *, robust: bool) -> None:
+    def iterate(self, *, robust: bool, settled_px: float = _CONVERGED_PX) -> None:
         """Gauss-Newton with Levenberg-Marquardt damping until no point moves; raises NotConverged."""
         damping = 1e-4
         whiten = self._whitening()
@@ -180,37 +199,40 @@ class Fit:
             gained = cost - trial_cost
             self.state, evaluation, cost = trial, trial_evaluation, trial_cost
             damping = max(damping / 10, 1e-12)
-            if moved < _CONVERGED_PX or (robust and gained < 1e-6 * (1 + cost)):
+            if moved < settled_px or (robust and gained < 1e-3 * (1 + cost)):
                 return
         if moved > 1e-3 and not robust:
             raise NotConverged("the level's fit", _ITERATIONS, moved)
 
     def _whitening(self) -> FloatArray:
-        """(N, 2, 2) matrices W with W^T W = inverse covariance of each point; zero for points that do not count."""
-        covariance = self.detector_px2 + np.eye(2) * self.floor_px**2
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-        return np.asarray(np.where(self.used[:, None, None], whiten, 0.0))
+        """(N, 3): w11, w21, w22 of lower triangles W with W^T W = inverse covariance of each point; zero for points
+        that do not count. From the Cholesky factor of the 2 x 2 covariance in closed form."""
+        covariance = self.detector_px2
+        uu, uv, vv = covariance[:, 0, 0] + self.floor_px**2, covariance[:, 0, 1], covariance[:, 1, 1] + self.floor_px**2
+        l11 = np.sqrt(uu)
+        l21 = uv / l11
+        l22 = np.sqrt(vv - l21 * l21)
+        whiten = np.column_stack([1 / l11, -l21 / (l11 * l22), 1 / l22])
+        return np.where(self.used[:, None], whiten, 0.0)
 
     def _robust_weights(self, whitened: FloatArray) -> FloatArray:
         # Cauchy: far points pull ever less, so a start with a few wrong ones still converges.
         return np.asarray(1.0 / (1.0 + np.sum(whitened**2, axis=1) / 4.0))
 
     def _cost(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> float:
-        whitened = (whiten @ evaluation.residual_px[..., None])[..., 0]
-        whitened = np.where(self.used[:, None], whitened, 0.0)
+        whitened = _whitened(whiten, evaluation.residual_px, self.used)
         squares = np.sum(whitened**2, axis=1)
         data = float(np.sum(4.0 * np.log1p(squares / 4.0))) if robust else float(np.sum(squares))
         priors = float(np.sum(evaluation.prior_residual**2)) + float(np.sum(evaluation.own_prior_residual**2))
         return data + priors
 
     def _normal(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> NormalEquations:
-        used = self.used[:, None]
-        whitened = np.where(used, (whiten @ evaluation.residual_px[..., None])[..., 0], 0.0)
+        whitened = _whitened(whiten, evaluation.residual_px, self.used)
         if robust:
             root = np.sqrt(self._robust_weights(whitened))
-            whitened, whiten = whitened * root[:, None], whiten * root[:, None, None]
-        shared = np.where(used[..., None], whiten @ evaluation.shared, 0.0)
-        own = np.where(used[..., None], whiten @ evaluation.own, 0.0) if self.problem.own_count.any() else None
+            whitened, whiten = whitened * root[:, None], whiten * root[:, None]
+        shared = _whitened(whiten, evaluation.shared, self.used)
+        own = _whitened(whiten, evaluation.own, self.used) if self.problem.own_count.any() else None
         return NormalEquations.of(self._rows, self.problem.own_count, evaluation, whitened, shared, own)
 
     def _degrees_of_freedom(self) -> int:
@@ -282,7 +304,7 @@ class Fit:
         covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
         column = self.problem.nodal_column
         residual = evaluation.residual_px
-        whitened = (whiten @ residual[..., None])[..., 0]
+        whitened = _whitened(whiten, residual, self.used)
         views, outliers = [], []
         for index, view in enumerate(self.problem.views):
             rows = self.problem.view_of == index
@@ -318,6 +340,7 @@ class Fit:
             iterations=self.iterations,
             sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
             mistakes=self._mistakes(inverse),
+            priors=self.priors,
         )
 
     def _mistakes(self, covariance: FloatArray) -> tuple[Mistake, ...]:
@@ -348,6 +371,17 @@ class Fit:
             subject, unit, prior = extras.subjects[index], extras.units[index], float(extras.sigmas[index])
             add(problem.first_extra + index, [name], subject, unit, state.extras[index : index + 1], prior)
         return tuple(found)
+
+
+def _whitened(whiten: FloatArray, values: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """W values for ``values`` (N, 2) or (N, 2, K), zero where not used (whatever stands there)."""
+    w11, w21, w22 = (whiten[:, i].reshape(-1, *[1] * (values.ndim - 2)) for i in range(3))
+    out = np.empty_like(values)
+    out[:, 0] = w11 * values[:, 0]
+    out[:, 1] = w21 * values[:, 0] + w22 * values[:, 1]
+    if not used.all():
+        out[~used] = 0.0
+    return out
 
 
 def _to_lens_parameters(lens: Lens, covariance: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ unknowns of the iteration are (log f_px, k1_hw, k2_hw, sx, sy): of like size for
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +96,7 @@ class Problem:
     ``lens_free`` False keeps the lens as it is (only poses move); ``held`` names lens quantities (``k1``, ``k2``,
     ``center_shift_px``) to be kept at 0, or ``nodal_offset_mm`` to be kept as it is. The nodal offset, with the prior
     ``nodal_sigma_mm``, is an unknown wherever posed pictures could tell it: taken as known, its error would hide in
-    the field of view.
+    the field of view. ``lifted`` as :meth:`calibration.solve.geometry.Geometry.lifted`.
     """
 
     def __init__(
@@ -109,12 +109,13 @@ class Problem:
         held: tuple[str, ...] = (),
         nodal_sigma_mm: float = PRIOR_NODAL_MM,
         priors: Priors | None = None,
+        lifted: Mapping[str, FloatArray] | None = None,
     ) -> None:
         self.views = tuple(views)
         self.lens_free = lens_free
         self.nodal_prior_mm = lens.nodal_offset_mm
         self._nodal_sigma_mm = nodal_sigma_mm
-        self.geometry = Geometry(self.views, priors or Priors(), shared_free=lens_free)
+        self.geometry = Geometry(self.views, priors or Priors(), shared_free=lens_free, lifted=lifted)
         shift_px = _HELD if "center_shift_px" in held else PRIOR_SHIFT_OF_WIDTH * lens.image_size[0]
         self._lens_sigmas = (
             _HELD if "k1" in held else PRIOR_K1_HW,
@@ -169,10 +170,10 @@ class Problem:
             shared[..., 1] = per_lens[..., 1] / h**2
             shared[..., 2] = per_lens[..., 2] / h**4
             shared[..., 3:5] = per_lens[..., 3:5]
-        d_ray = np.zeros((len(points), 2, 3))
-        d_ray[:, 0, 0] = d_ray[:, 1, 1] = 1 / z
-        d_ray[:, :, 2] = -rays / z[:, None]
-        per_point = lens.jacobian_rays(rays) @ d_ray
+        by_ray = lens.jacobian_rays(rays)
+        per_point = np.empty((len(points), 2, 3))  # px per metre
+        per_point[..., :2] = by_ray / z[:, None, None]
+        per_point[..., 2] = -(per_point[..., 0] * rays[:, :1] + per_point[..., 1] * rays[:, 1:])
         if self.nodal_free:
             shared[..., self.nodal_column] = np.where(self.geometry.posed[:, None], -0.001 * per_point[..., 2], 0.0)
         self.geometry.fill_shared(

@@ -37,3 +37,12 @@ def rotation_log(R: FloatArray) -> FloatArray:
     sine = float(np.linalg.norm(v))
     angle = math.atan2(sine, (float(np.trace(R)) - 1) / 2)
     return np.asarray(v if sine < 1e-12 else v * angle / sine)
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a x b of vectors (..., 3); numpy's own costs several times as much on a few thousand."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out

@@ -185,7 +185,7 @@ def test_the_problem_jacobian_agrees_with_a_numeric_one() -> None:
     lens, poses = start(views, SIZE, 1.001, 30.0, WIDE)
     priors = Priors(0.002, 0.01, 0.01, 0.1, 0.1, 0.1, 5.0)
     problem = Problem(views, replace(lens, nodal_offset_mm=30.0, pixel_aspect=1.001), poses, priors=priors)
-    assert len(problem.extras.names) == 9
+    assert len(problem.extras.names) == 17
     own = (np.arange(6) < problem.own_count[:, None]).astype(float)
     shared_count, size = problem.shared_count, 1e-6
 
