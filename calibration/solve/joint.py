@@ -391,6 +391,7 @@ class JointMethod:
             nodal_offset_mm=self._task.nodal_offset_mm,
             nodal_sigma_mm=self._task.nodal_sigma_mm,
             straight=straight,
+            priors=self._task.priors,
         )
 
     def _lens(self) -> Lens:
