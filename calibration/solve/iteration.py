@@ -31,6 +31,7 @@ from calibration.solve.problem import (
     View,
 )
 from calibration.solve.rotation import rotation_log
+from calibration.tables import Parallax
 from calibration.types import FloatArray
 
 _ITERATIONS = 200
@@ -68,13 +69,14 @@ class LevelFit:
 
     ``covariance`` (5, 5) is of (f_px, k1, k2, sx, sy) as :data:`calibration.lens.LENS_PARAMETERS`. ``rms_px`` is per
     coordinate, ``max_px`` a distance, both over the points that counted. ``floor_px`` see the module.
-    ``outliers``: (picture, point number, distance px); ``dropped``: pictures left out with their reasons.
-    ``poses``: camera from target (R, t in metres) of each free picture, by name. ``untold`` names the quantities
-    (``k1``, ``k2``, ``center_shift_px``) that the pictures do not show: they are held at 0 in ``lens``, while
-    ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
-    pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
-    stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
-    ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns with ``priors``.
+    ``outliers``: (picture, point number, distance px); ``dropped``: pictures left out with their reasons. ``poses``:
+    camera from target (R, t in metres) of each free picture, by name. ``untold`` names the quantities (``k1``, ``k2``,
+    ``center_shift_px``) that the pictures do not show: they are held at 0 in ``lens``, while ``covariance`` is still
+    that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed pictures tell and its sigma,
+    None without such pictures; ``nodal_told``: it contradicts the one given, so that it stands in ``lens`` (else the
+    given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held. ``parallax``: the operator's check,
+    where it was told. ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns
+    with ``priors``.
     """
 
     lens: Lens
@@ -94,6 +96,7 @@ class LevelFit:
     priors: Priors = field(default_factory=Priors)
     nodal_told: bool = False
     nodal_seen_mm: tuple[float, float] | None = None
+    parallax: Parallax | None = None
 
     @property
     def sigma(self) -> FloatArray:

@@ -18,6 +18,7 @@ from calibration.errors import InvalidInput, NotConverged, NotEnoughData
 from calibration.lens import Lens
 from calibration.solve.iteration import Fit, LevelFit
 from calibration.solve.mistakes import Priors
+from calibration.solve.nodal import MEASURED_MM, parallax, two_distances
 from calibration.solve.problem import (
     LENS_COUNT,
     PRIOR_K1_HW,
@@ -55,11 +56,11 @@ def solve_level(
 ) -> LevelFit:
     """Fit one lens to all pictures of a level. Raises :class:`calibration.errors.CalibrationError`.
 
-    ``nodal_offset_mm`` stands unless the pictures contradict it; with a ``nodal_sigma_mm`` it is only a prior, and what
-    the pictures and the prior leave open shows in the covariance. ``guess`` is a lens to start from; without one the
-    start is found from the pictures alone. ``straight`` holds k1 and k2 at 0: for the first pictures, which tell only
-    where to look next. ``priors``: how large mistakes of survey, board, head and camera may be
-    (:class:`calibration.solve.mistakes.Priors`).
+    ``nodal_offset_mm`` stands unless the pictures contradict it, or show targets at two distances and tell it; with a
+    ``nodal_sigma_mm`` it is only a prior, and what the pictures and the prior leave open shows in the covariance.
+    ``guess`` is a lens to start from; without one the start is found from the pictures alone. ``straight`` holds k1 and
+    k2 at 0: for the first pictures, which tell only where to look next. ``priors``: how large mistakes of survey,
+    board, head and camera may be (:class:`calibration.solve.mistakes.Priors`).
     """
     if not views:
         raise NotEnoughData("no picture of this level shows its target")
@@ -115,7 +116,8 @@ def _solve(views: Sequence[View], known: _Known) -> LevelFit:
     seen = None if fit.sigma_nodal_mm is None else (fit.lens.nodal_offset_mm, fit.sigma_nodal_mm)
     nodal_told = False
     if seen is not None:
-        nodal_told = nodal_sigma_mm > 0 or abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
+        measured = two_distances(kept) and seen[1] <= MEASURED_MM
+        nodal_told = measured or nodal_sigma_mm > 0 or abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
         if not nodal_told:
             # What contradicts nothing stays as given: left free, it would only take exactness from the field of view.
             given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
@@ -129,7 +131,8 @@ def _solve(views: Sequence[View], known: _Known) -> LevelFit:
         again = Fit(kept, fit.lens, fitted.free_poses(), held=held_at, priors=priors)
         again.run(after=fitted)
         fit = replace(again.result(tuple(dropped)), covariance=fit.covariance, sigma_nodal_mm=fit.sigma_nodal_mm)
-    return replace(fit, untold=untold, nodal_told=nodal_told, nodal_seen_mm=seen)
+    check = parallax(fit.lens, nodal_offset_mm, seen[1], kept) if seen is not None and nodal_told else None
+    return replace(fit, untold=untold, nodal_told=nodal_told, nodal_seen_mm=seen, parallax=check)
 
 
 def _first_fit(kept: list[View], known: _Known) -> Fit:
