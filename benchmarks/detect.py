@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.pictures import Array, draw_board, random_view
+from benchmarks.blur import Array
+from benchmarks.pictures import draw_board, random_view
 from calibration.detect.prediction import Prediction
 from calibration.detect.target import find_target
 from calibration.image import decode_picture

@@ -13,6 +13,7 @@ from calibration.detect.prediction import Prediction
 from calibration.detect.quality import median_sides
 from calibration.detect.saddle import Gray, find_saddles, reduce_picture
 from calibration.detect.signal import surrounded
+from calibration.detect.windows import Reduced
 from calibration.types import FloatArray, Picture
 
 _FIRST_WIDTH_PX = 1000
@@ -30,13 +31,15 @@ class Board:
     """The asked grid as the coarse search saw it, in pixels of the picture.
 
     ``points_px`` (rows, columns, 2), every place filled (from its neighbours where not seen); ``polarity`` as in
-    :class:`Grid`; ``whole``: the outer squares lie inside the picture; ``error_px`` how far a point may be off.
+    :class:`Grid`; ``whole``: the outer squares lie inside the picture; ``error_px`` how far a point may be off;
+    ``plane`` the reduced channel it was found in, in coded values.
     """
 
     points_px: FloatArray
     polarity: int
     whole: bool
     error_px: float
+    plane: Reduced
 
 
 def find_board(
@@ -67,7 +70,8 @@ def find_board(
             if oriented is None or oriented.present < _LEAST_PRESENT * size[0] * size[1]:
                 others.append(full)
                 continue
-            board = _board(oriented, picture, error_px=0.3 * factor)
+            plane = Reduced(gray, factor, (int(corner[0]), int(corner[1])), 1.0, 1.0)
+            board = _board(oriented, picture, 0.3 * factor, plane)
             if near is None or _fits(board, near):
                 boards.append(board)
         result = _choose(boards, size, near)
@@ -179,7 +183,7 @@ def _open_sides(points_px: FloatArray, picture: Picture) -> tuple[int, int]:
     return sum(share < 0.5 for share in left_right), sum(share < 0.5 for share in top_bottom)
 
 
-def _board(grid: Grid, picture: Picture, error_px: float) -> Board:
+def _board(grid: Grid, picture: Picture, error_px: float, plane: Reduced) -> Board:
     points = grid.points
     while not np.isfinite(points).all():
         expected = predict_missing(points)
@@ -187,7 +191,7 @@ def _board(grid: Grid, picture: Picture, error_px: float) -> Board:
         if np.isfinite(filled).sum() == np.isfinite(points).sum():
             break
         points = filled
-    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px)
+    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px, plane)
 
 
 def _choose(boards: list[Board], size: tuple[int, int], near: Prediction | None) -> Board | str | None:
