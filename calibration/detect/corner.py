@@ -38,8 +38,9 @@ _SIGN = np.uint32(0x80000000)
 @dataclass(frozen=True, slots=True, eq=False)
 class CornerFit:
     """The fitted ``state``; ``covariance_px2`` (N, 2, 2) at the assumed noise; ``chi2`` (N,) mean squared residual over
-    the noise variance; ``pixels`` (N,) used; ``bend_px2`` (N, 2): for a curvature that is more by 1/px than was assumed, each edge
-    stands so far back along its normal (-sin, cos). Covariance and chi2 are NaN for a corner that could not be fitted.
+    the noise variance; ``pixels`` (N,) used; ``bend_px2`` (N, 2): for a curvature that is more by 1/px than was
+    assumed, each edge stands so far back along its normal (-sin, cos). Covariance and chi2 are NaN for a corner that
+    could not be fitted.
     """
 
     state: CornerState

@@ -34,12 +34,13 @@ from calibration.image import Transfer
 from calibration.types import FloatArray, Picture
 
 _GUESSED_SIGMAS = (0.5, 1.0, 2.0, 4.0)
-_FEW = 12
+_FEW = 9
 _ROUGH_HALF = 6
 _ROUGH_ITERATIONS = 8
 _FEW_ITERATIONS = 8
 _LAST_ITERATIONS = 6
-_HALF_PX = 24
+_HALF_PX = 16
+_FEW_HALF_PX = 12
 _BAND_SIGMAS = 3.0
 _STEP_SHARE = 0.06
 """A step of this share of the blur leaves an error of about its square: 0.4 % of the blur."""
@@ -128,7 +129,7 @@ def _rough(board: Board, points: FloatArray, steps: FloatArray, sign: FloatArray
         if sigma > max(0.5 * side, _GUESSED_SIGMAS[0]):
             break
         few = CornerState(few.points_px, few.angles, np.full(len(some), sigma), few.offset, few.gain)
-        windows = strip_windows(plane, few, steps[some] / pixel, 0.5 * side, 0.3 * side)
+        windows = strip_windows(plane, few, steps[some] / pixel, 0.5 * side, 0.2 * side)
         share = float(np.median(explained(windows, few)[0]))
         if share > best_share:
             best, best_share = sigma, share
@@ -157,7 +158,7 @@ def _blur_of_a_few(
     few = start.of(some)
     few = CornerState(few.points_px, few.angles, np.clip(few.sigma_px, 0.7, 1.5), few.offset, few.gain)
     windows = strip_windows(
-        light.signal, few, steps[some], 0.5 * _HALF_PX, _BAND_SIGMAS * max(float(few.sigma_px[0]), sigma)
+        light.signal, few, steps[some], _FEW_HALF_PX, _BAND_SIGMAS * max(float(few.sigma_px[0]), sigma)
     )
     fit = fit_corners(windows, few, curvature[some], iterations=_FEW_ITERATIONS, tolerance_px=0.05)
     fine = np.isfinite(fit.chi2)

@@ -31,9 +31,9 @@ _LEAST_GAIN = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardLight:
-    """``signal`` and how it falls over the board at its corners, in the order of the grid's points: ``offset`` (N,) middle
-    of the two colours, ``gain`` (N,) half their difference, > 0; ``per_step`` (N, 2, 2): relative change (of the gain)
-    of offset [:, 0] and gain [:, 1] from a column and a row to the next.
+    """``signal`` and how it falls over the board at its corners, in the order of the grid's points: ``offset`` (N,)
+    middle of the two colours, ``gain`` (N,) half their difference, > 0; ``per_step`` (N, 2, 2): change, relative to the
+    gain, of offset [:, 0] and gain [:, 1] from a column and a row to the next.
     """
 
     signal: Signal

@@ -110,7 +110,7 @@ class Signal:
         light = self.tables[0].take(flat.take(first))
         light += self.tables[1].take(flat[1:].take(first))
         light += self.tables[2].take(flat[2:].take(first))
-        return light
+        return np.asarray(light)
 
     def reduced(self, factor: int, low_px: FloatArray, high_px: FloatArray) -> Reduced:
         """The light between two corners of a box, each value the mean of ``factor`` x ``factor`` pixels."""
@@ -155,8 +155,8 @@ class Reduced:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shading:
-    """How the light falls at N corners: ``offset`` (N,) and, per pixel, the change of the ``offset`` and the relative one
-    of the gain, (N, 2) each.
+    """How the light falls at N corners: ``offset`` (N,) and, per pixel, the change of the ``offset`` and the relative
+    change of the gain, (N, 2) each.
     """
 
     offset: FloatArray
