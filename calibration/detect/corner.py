@@ -28,7 +28,7 @@ from calibration.types import FloatArray, IntArray
 PARAMETERS = 7
 _FIRST_DAMPING = 1e-3
 _LEAST_PIXELS = 21
-_SMALL_STEPS = (0.05, 0.02, 0.02)  # ln s, and offset and gain (of the board's contrast)
+_SMALL_STEPS = (0.05, 0.04, 0.04)  # ln s, and offset and gain as shares of the gain
 _BLOCK_PIXELS = 16000
 _FAR = np.float32(40.0)
 """exp(-40): far enough for any picture, and its square is still a normal float32 (those below are slow)."""
@@ -188,13 +188,15 @@ def fit_corners(
     *,
     iterations: int,
     tolerance_px: float = 1e-3,
+    loose: float = 1.0,
     kernel: Kernel = GAUSSIAN,
 ) -> CornerFit:
     """Fit all corners from ``start``; ``curvature_per_px`` (N, 2) of the two edges; at most ``iterations`` steps each.
 
     Everything in the windows' own pixels. Angle k is that of edge k: edge 0 runs along the columns' direction, edge 1
     along the rows'. A corner is done when a step moves it by less than ``tolerance_px``: a Gauss-Newton step leaves
-    about its own square over the blur, so the step is taken without looking again.
+    about its own square over the blur, so the step is taken without looking again. ``loose`` widens what blur, offset
+    and gain may still change by then: they matter where covariance and residuals are asked for.
     """
     count = len(start.points_px)
     curvature = None if curvature_per_px is None else curvature_per_px.astype(np.float32)
@@ -213,7 +215,9 @@ def fit_corners(
         done = (np.abs(trial.points_px - best.points_px[todo]).max(axis=1) < tolerance_px) & (
             damping[todo] <= _FIRST_DAMPING
         )
-        done &= (np.abs(step[:, 4:]) < _SMALL_STEPS).all(axis=1)
+        unit = np.ones((len(todo), 3))
+        unit[:, 1:] = np.abs(best.gain[todo])[:, None]
+        done &= (np.abs(step[:, 4:]) < loose * np.array(_SMALL_STEPS) * unit).all(axis=1)
         # A turn moves an edge's far pixels: by this much in the mean over its window.
         power = np.maximum(np.einsum("nii->ni", product[todo])[:, :4], 1e-30)
         done &= (np.abs(step[:, 2:4]) * np.sqrt(power[:, 2:] / power[:, :2]) < tolerance_px).all(axis=1)

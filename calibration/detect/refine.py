@@ -35,11 +35,12 @@ from calibration.types import FloatArray, Picture
 
 _GUESSED_SIGMAS = (0.5, 1.0, 2.0, 4.0)
 _FEW = 9
-_ROUGH_HALF = 6
+_ROUGH_HALF = 5
 _ROUGH_ITERATIONS = 8
 _FEW_ITERATIONS = 8
 _LAST_ITERATIONS = 6
 _HALF_PX = 16
+_HALF_SIGMAS = 8
 _FEW_HALF_PX = 12
 _BAND_SIGMAS = 3.0
 _STEP_SHARE = 0.06
@@ -92,7 +93,7 @@ def refine(picture: Picture, board: Board, transfer: Transfer) -> Measured | Non
     sigma = _blur_of_a_few(light, start, steps, curvature, good, sigma)
     factor = next((one for least, one in _REDUCED_FROM_SIGMA_PX if sigma > least and side / one > _SMALLEST_SIDE), 1)
     start = CornerState(start.points_px, start.angles, np.full(len(points), sigma), start.offset, start.gain)
-    half_px = max(_HALF_PX, round(3.5 * sigma))
+    half_px = max(_HALF_PX, round(_HALF_SIGMAS * sigma))
     plane: Plane = light.signal
     if factor > 1:
         reach = half_px + factor
@@ -134,11 +135,11 @@ def _rough(board: Board, points: FloatArray, steps: FloatArray, sign: FloatArray
         if share > best_share:
             best, best_share = sigma, share
     start = CornerState(start.points_px, angles, np.full(count, best), start.offset, start.gain)
-    half, band = max(_ROUGH_HALF, 2.5 * best), 2.5 * best + 1 + error
+    half, band = max(_ROUGH_HALF, 2.5 * best), 2 * best + 0.5 + error
     windows = strip_windows(plane, start, steps / pixel, half, band)
     _, offset, gain = explained(windows, start)
     start = CornerState(start.points_px, angles, start.sigma_px, offset, gain)
-    fit = fit_corners(windows, start, None, iterations=_ROUGH_ITERATIONS, tolerance_px=0.1)
+    fit = fit_corners(windows, start, None, iterations=_ROUGH_ITERATIONS, tolerance_px=0.15, loose=4.0)
     return from_plane(plane, fit.state)
 
 

@@ -250,35 +250,42 @@ def strip_windows(
     widest = band_px / float(np.maximum(np.abs(cos), np.abs(sin)).min(initial=1.0))
     wide = max(int(np.ceil(widest)), 1)
 
-    along = np.arange(-reach, reach + 1)
-    middle = np.rint(slope[:, :, None] * along + shift[:, :, None])  # (N, 2, K)
-    across = middle[..., None] + np.arange(-wide, wide + 1)  # (N, 2, K, B)
-    shape = across.shape
-    long = np.broadcast_to(along[:, None], shape)
-    flip = level[:, :, None, None]
-    du = np.where(flip, long, across).astype(np.float32)
-    dv = np.where(flip, across, long).astype(np.float32)
+    # (N, edge, across, along): numpy is quick where the last axis is long.
+    along = np.arange(-reach, reach + 1, dtype=np.float32)
+    middle = np.rint(slope[:, :, None] * along + shift[:, :, None]).astype(np.float32)  # (N, 2, K)
+    across = middle[:, :, None, :] + np.arange(-wide, wide + 1, dtype=np.float32)[:, None]
+    du, dv = across.copy(), across
+    for edge in (0, 1):
+        du[level[:, edge], edge] = along
+        dv[~level[:, edge], edge] = along
+    each = across.shape[2] * across.shape[3]
+    du, dv = du.reshape(count, 2 * each), dv.reshape(count, 2 * each)
 
     determinant = steps_px[:, 0, 0] * steps_px[:, 1, 1] - steps_px[:, 0, 1] * steps_px[:, 1, 0]
     adjugate = np.stack([steps_px[:, 1, 1], -steps_px[:, 1, 0], -steps_px[:, 0, 1], steps_px[:, 0, 0]])
-    inverse = (adjugate / (determinant * WINDOW_SHARE)).astype(np.float32)
-    base = np.stack(
-        [inverse[0] * local[:, 0] + inverse[1] * local[:, 1], inverse[2] * local[:, 0] + inverse[3] * local[:, 1]]
-    ).astype(np.float32)
-    view = (slice(None), None, None, None)
-    used = np.abs(inverse[0][view] * du + inverse[1][view] * dv - base[0][view]) <= 1
-    used &= np.abs(inverse[2][view] * du + inverse[3][view] * dv - base[1][view]) <= 1
-    used &= (np.abs(along) <= longest[..., None] + 0.5)[..., None]
+    inverse = (adjugate / (determinant * WINDOW_SHARE)).astype(np.float32)[:, :, None]
+    used = np.ones(du.shape, dtype=bool)
+    for k in (0, 2):
+        place = inverse[k] * du
+        place += inverse[k + 1] * dv
+        place -= (inverse[k, :, 0] * local[:, 0] + inverse[k + 1, :, 0] * local[:, 1]).astype(np.float32)[:, None]
+        used &= np.abs(place, out=place) <= 1
+    by_edge = used.reshape(count, 2, each // len(along), len(along))
+    by_edge &= (np.abs(along) <= longest[..., None] + 0.5)[:, :, None, :]
     # A pixel of both strips counts once.
-    other = level[:, 0, None, None]
-    first_along = np.where(other, du[:, 1], dv[:, 1])
-    first_across = np.where(other, dv[:, 1], du[:, 1])
-    line = np.rint(slope[:, :1, None].astype(np.float32) * first_along + shift[:, :1, None].astype(np.float32))
-    used[:, 1] &= (np.abs(first_across - line) > wide) | (np.abs(first_along) > longest[:, :1, None] + 0.5)
+    first = level[:, :1]
+    first_along = np.where(first, du[:, each:], dv[:, each:])
+    line = first_along * slope[:, :1].astype(np.float32)
+    line += shift[:, :1].astype(np.float32)
+    np.rint(line, out=line)
+    line -= np.where(first, dv[:, each:], du[:, each:])
+    twice = np.abs(line, out=line) <= wide
+    twice &= np.abs(first_along, out=first_along) <= longest[:, :1] + 0.5
+    used[:, each:] &= ~twice
 
     width, height = plane.size
-    u = du + centres[:, 0].astype(np.float32)[view]
-    v = dv + centres[:, 1].astype(np.float32)[view]
+    u = du + centres[:, :1].astype(np.float32)
+    v = dv + centres[:, 1:].astype(np.float32)
     low, high = centres.min(axis=0, initial=0) - reach - 1, centres.max(axis=0, initial=0) + reach + 1
     if low.min() < reach or high[0] > width - 1 - reach or high[1] > height - 1 - reach:
         used &= (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
@@ -287,13 +294,12 @@ def strip_windows(
     index = v.astype(np.int32)
     index *= np.int32(width)
     index += u.astype(np.int32)
-    values = plane.at(index.reshape(count, -1))
-    du, dv = du.reshape(count, -1), dv.reshape(count, -1)
+    values = plane.at(index)
     if shading is not None:
         _flatten(values, du, dv, local, shading, plane.pixel_px)
     return Windows(
         values,
-        used.reshape(count, -1).astype(np.float32),
+        used.astype(np.float32),
         centres,
         du,
         dv,
