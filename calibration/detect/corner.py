@@ -8,7 +8,6 @@ with a = d / s, E(d) = erf(a / sqrt 2), and rho the cosine between the two edges
 second order, of the orthant probability of the bivariate normal, exact for edges that cross at a right angle. The box
 of a pixel is part of s (it adds 1/12 px^2 to the variance along any direction). An edge may be bent, as a straight line
 seen through a lens is: d is then d_line - curvature / 2 * (way along the edge)^2, the curvature known from the grid.
-Another blur is a weighted sum of Gaussians (:mod:`calibration.detect.kernel`), and so is its F.
 
 Free for each corner: x, y, two angles, ln s, o, g. Gauss-Newton with Levenberg's damping, weights from the noise at
 the model's light, so the inverse normal matrix is the Cramer-Rao bound and is returned as the covariance.
@@ -21,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.detect.kernel import GAUSSIAN, Kernel
 from calibration.detect.windows import SHARPEST_SIGMA_PX, CornerState, Pixels, Windows
 from calibration.types import FloatArray, IntArray
 
@@ -81,7 +79,7 @@ class Shape:
     t2: Pixels
 
 
-def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None, kernel: Kernel = GAUSSIAN) -> Shape:
+def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None) -> Shape:
     """F of ``state`` (in the windows' pixels) over the windows; ``curvature`` (N, 2) or None for straight edges."""
     cos, sin = np.cos(state.angles), np.sin(state.angles)
     local = state.points_px - windows.centres
@@ -106,24 +104,17 @@ def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None,
         distances.append(d)
     d1, d2 = distances
     rho = np.cos(state.angles[:, :1] - state.angles[:, 1:]).astype(np.float32)
-    parts = [
-        _gaussian_part(d1, d2, rho, (np.sqrt(0.5) / (width * state.sigma_px)).astype(np.float32)[:, None], weight)
-        for width, weight in zip(kernel.widths, kernel.weights, strict=True)
-    ]
-    value, slope1, slope2 = parts[0]
-    for more, more1, more2 in parts[1:]:
-        value += more
-        slope1 += more1
-        slope2 += more2
+    scale = (np.sqrt(0.5) / state.sigma_px).astype(np.float32)[:, None]
+    value, slope1, slope2 = _blurred(d1, d2, rho, scale)
     return Shape(value, slope1, slope2, d1, d2, ways[0], ways[1])
 
 
-def _gaussian_part(d1: Pixels, d2: Pixels, rho: Pixels, scale: Pixels, weight: float) -> tuple[Pixels, Pixels, Pixels]:
-    """F of one Gaussian, and its derivatives with respect to d1 and d2, times ``weight``; ``scale`` = 1/(s sqrt 2)."""
+def _blurred(d1: Pixels, d2: Pixels, rho: Pixels, scale: Pixels) -> tuple[Pixels, Pixels, Pixels]:
+    """F and its derivatives with respect to d1 and d2; ``scale`` = 1 / (s sqrt 2)."""
     a1, a2 = d1 * scale, d2 * scale
     gauss1, gauss2 = _gauss(a1), _gauss(a2)
     erf1, erf2 = _erf(a1, gauss1), _erf(a2, gauss2)
-    steep = scale * np.float32(weight * 2 / np.sqrt(np.pi))
+    steep = scale * np.float32(2 / np.sqrt(np.pi))
     rise1 = gauss1 * erf2
     rise1 *= steep
     rise2 = gauss2 * erf1
@@ -137,8 +128,6 @@ def _gaussian_part(d1: Pixels, d2: Pixels, rho: Pixels, scale: Pixels, weight: f
     a1 *= gauss1
     a1 *= np.float32(2 / np.pi) * rho
     erf1 += a1
-    if weight != 1.0:
-        erf1 *= np.float32(weight)
     return erf1, rise1, rise2
 
 
@@ -149,12 +138,10 @@ def _gauss(a: Pixels) -> Pixels:
     return np.asarray(np.exp(square, out=square))
 
 
-def explained(
-    windows: Windows, state: CornerState, kernel: Kernel = GAUSSIAN
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def explained(windows: Windows, state: CornerState) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(share of the windows' variance that F explains, offset, gain), (N,) each, with offset and gain solved for."""
     count = np.maximum(windows.used.sum(axis=1, dtype=np.float64), 1.0)
-    value = corner_shape(windows, state, None, kernel).value
+    value = corner_shape(windows, state, None).value
     mean = np.einsum("np,np->n", windows.used, windows.values) / count
     middle = np.einsum("np,np->n", windows.used, value) / count
     flat = value - middle[:, None].astype(np.float32)
@@ -189,7 +176,6 @@ def fit_corners(
     iterations: int,
     tolerance_px: float = 1e-3,
     loose: float = 1.0,
-    kernel: Kernel = GAUSSIAN,
 ) -> CornerFit:
     """Fit all corners from ``start``; ``curvature_per_px`` (N, 2) of the two edges; at most ``iterations`` steps each.
 
@@ -202,7 +188,7 @@ def fit_corners(
     curvature = None if curvature_per_px is None else curvature_per_px.astype(np.float32)
     best = start.copy()
     damping = np.full(count, _FIRST_DAMPING)
-    product = _products(windows, best, curvature, kernel)
+    product = _products(windows, best, curvature)
     cost = product[:, 7, 7].copy()
     active = np.isfinite(cost)
     todo = np.nonzero(active)[0]
@@ -230,7 +216,7 @@ def fit_corners(
             todo, trial = todo[rest], trial.of(rest)
             if not len(todo):
                 break
-        found = _products(windows.of(todo), trial, None if curvature is None else curvature[todo], kernel)
+        found = _products(windows.of(todo), trial, None if curvature is None else curvature[todo])
         new_cost = found[:, 7, 7]
         better = np.nonzero(np.isfinite(new_cost) & (new_cost <= cost[todo] * (1 + 1e-3)))[0]
         good = todo[better]
@@ -288,7 +274,7 @@ def shifted(angles: FloatArray, shifts_px: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj->ni", _crossing(angles), shifts_px))
 
 
-def _products(windows: Windows, state: CornerState, curvature: Pixels | None, kernel: Kernel) -> FloatArray:
+def _products(windows: Windows, state: CornerState, curvature: Pixels | None) -> FloatArray:
     """(N, 8, 8): the weighted products of the seven derivatives and, last, the residual.
 
     The first two derivatives are along the edges' normals: with respect to x and y they are sums of these two.
@@ -303,13 +289,13 @@ def _products(windows: Windows, state: CornerState, curvature: Pixels | None, ke
             state.points_px[some], state.angles[some], state.sigma_px[some], state.offset[some], state.gain[some]
         )
         product[some] = _block_products(
-            windows.block(some.start, some.stop), part, None if curvature is None else curvature[some], kernel
+            windows.block(some.start, some.stop), part, None if curvature is None else curvature[some]
         )
     return product
 
 
-def _block_products(windows: Windows, state: CornerState, curvature: Pixels | None, kernel: Kernel) -> Pixels:
-    shape = corner_shape(windows, state, curvature, kernel)
+def _block_products(windows: Windows, state: CornerState, curvature: Pixels | None) -> Pixels:
+    shape = corner_shape(windows, state, curvature)
     gain, offset = state.gain.astype(np.float32)[:, None], state.offset.astype(np.float32)[:, None]
     model = gain * shape.value
     model += offset
