@@ -58,6 +58,9 @@ BENCHMARKS = {
             "levels", "the joint and the study's alternating method on the same simulated studio", "benchmarks.levels"
         ),
         Benchmark("detect", "finding a chessboard, beside OpenCV's detectors", "benchmarks.detect"),
+        Benchmark(
+            "nodal", "the nodal offset from targets at one and two distances, beside public ways", "benchmarks.nodal"
+        ),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
         Benchmark(
             "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"

@@ -14,6 +14,7 @@ from calibration.solve.center_shift import center_shift_from_centre
 from calibration.solve.engine_check import EngineAgreement
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import MISFIT_PX
+from calibration.solve.nodal import MEASURED_MM
 from calibration.solve.problem import View
 from calibration.tables import (
     EVIDENCE_QUANTITIES,
@@ -40,8 +41,6 @@ _OUTLIER_SHARE = 0.03
 _FEWEST_OUTLIERS = 3
 _ON_AXIS = 1e-4
 # Tangent of the angle off the optical axis under which a thing counts as on it: half a pixel at 5,000 px.
-_NODAL_LOOSE_MM = 2.0
-# A nodal offset less certain than this is what most of a large expected error comes from.
 _NODAL_HINT = 3.0
 # Sigmas of the nodal offset at which a level is called degraded before it is certain enough to be used.
 
@@ -149,13 +148,14 @@ def _useless(fit: LevelFit, expected_max_px: float) -> str | None:
 def _trouble(fit: LevelFit, expected_max_px: float) -> list[str]:
     trouble: list[str] = []
     if not math.isfinite(expected_max_px) or expected_max_px > USABLE_OVERLAY_PX:
-        advice = "take more pictures, the target nearer the corners"
-        if fit.nodal_told and fit.sigma_nodal_mm is not None and fit.sigma_nodal_mm > _NODAL_LOOSE_MM:
-            advice = (
-                f"the nodal offset is known to {fit.sigma_nodal_mm:.0f} mm only and shows as field of view: add a "
-                "target at another distance"
-            )
-        trouble.append(f"expected overlay error up to {expected_max_px:.1f} px: {advice}")
+        trouble.append(
+            f"expected overlay error up to {expected_max_px:.1f} px: take more pictures, the target nearer the corners"
+        )
+    if fit.nodal_told and fit.sigma_nodal_mm is not None and fit.sigma_nodal_mm > MEASURED_MM:
+        trouble.append(
+            f"the nodal offset is known to {fit.sigma_nodal_mm:.1f} mm only and shows as field of view: add a target "
+            "at another distance"
+        )
     if fit.floor_px > MISFIT_PX:
         worst = max(fit.views, key=lambda view: view.rms_px)
         trouble.append(
