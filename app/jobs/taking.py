@@ -22,7 +22,7 @@ from calibration.lens import Lens
 from calibration.solve.search import Capture, LevelTask, Observation, Source
 from calibration.types import DetectionResult, Picture, Refusal
 from engine_adapters.errors import AdapterError, BadPicture
-from engine_adapters.ports import HeadState, LensValues, Shown
+from engine_adapters.ports import EncodedFrame, HeadState, LensValues, Shown
 from engine_adapters.retry import Verdict, classify_head, classify_mockboard, classify_r3, retry
 
 T = TypeVar("T")
@@ -31,6 +31,8 @@ _SHOWN = {Source.REAL: Shown.REAL, Source.VIRTUAL: Shown.VIRTUAL}
 _REFETCHES = 8
 # Pictures taken once more because the output had not changed yet; then it is frozen, and that is said.
 _DELAY_ROUNDS = 2
+_DAMAGED_BOUND = 2
+# Damaged pictures in a row of them that are passed over while the delay is measured.
 _DELAY_BOUND_S = 3.0
 # Longest delay of an output that is believed: a chain of frame stores stays far below.
 
@@ -104,23 +106,47 @@ class PictureTaker:
         for shown in (Shown.NOTHING, Shown.REAL) * _DELAY_ROUNDS:
             await self._show(shown)
             acknowledged = time.monotonic()
+            requested, base = await self._next_change(base, acknowledged, shown)
+            longest = max(longest, requested - acknowledged)
+        # A request made this long after a change was seen to answer it; one picture more for the clock's grain.
+        self.delay.delay_s = longest + self.delay.picture_s
+        self._last, self._must_change = base, False
+
+    async def _next_change(
+        self, base: NDArray[np.float32], acknowledged_s: float, shown: Shown
+    ) -> tuple[float, NDArray[np.float32]]:
+        """The first picture that differs from ``base``: when it was asked for, and its thumbnail.
+
+        Each picture is decoded while the next is fetched, so that decoding does not coarsen the clock.
+        """
+        damaged = 0
+        fetching = asyncio.create_task(self._again(self._studio.frames.fetch, classify_mockboard))
+        try:
             while True:
-                requested = time.monotonic()
-                seen = await self._fetch_small()
-                self.delay.picture_s = time.monotonic() - requested
+                frame = await fetching
+                fetching = asyncio.create_task(self._again(self._studio.frames.fetch, classify_mockboard))
+                try:
+                    seen = await self._cpu.run(thumbnail, await self._decoded(frame))
+                except BadPicture:
+                    damaged += 1
+                    if damaged > _DAMAGED_BOUND:
+                        raise
+                    continue
+                self.delay.picture_s = frame.received_at_s - frame.requested_at_s
                 if changed(base, seen):
-                    break
-                if requested - acknowledged > _DELAY_BOUND_S:
+                    return frame.requested_at_s, seen
+                if frame.requested_at_s - acknowledged_s > _DELAY_BOUND_S:
                     raise OutputDoesNotFollow(
                         f"the output did not follow within {_DELAY_BOUND_S:g} s when the background was switched "
                         f"{'off' if shown is Shown.NOTHING else 'on'}: does the MockBoard show this engine's output, "
                         "and are the profile's scene and export names right?"
                     )
-            longest = max(longest, requested - acknowledged)
-            base = seen
-        # A request made this long after a change was seen to answer it; one picture more for the clock's grain.
-        self.delay.delay_s = longest + self.delay.picture_s
-        self._last, self._must_change = base, False
+        except BaseException:
+            fetching.cancel()
+            raise
+        finally:
+            # The one asked for too many ends by itself: cut off, it would cost its connection.
+            await asyncio.gather(fetching, return_exceptions=True)
 
     async def take(self, capture: Capture) -> Taken:
         """One fresh picture of what ``capture`` wants."""
@@ -205,13 +231,15 @@ class PictureTaker:
     async def _fetch_small(self) -> NDArray[np.float32]:
         return await self._cpu.run(thumbnail, await self._fetch())
 
+    async def _decoded(self, frame: EncodedFrame) -> Picture:
+        try:
+            return await self._cpu.run(decode_picture, frame.data, expected_size=self._image_size)
+        except InvalidInput as error:
+            raise BadPicture(str(error), where=frame.source) from error
+
     async def _fetch(self) -> Picture:
         async def goal() -> Picture:
-            frame = await self._studio.frames.fetch()
-            try:
-                return await self._cpu.run(decode_picture, frame.data, expected_size=self._image_size)
-            except InvalidInput as error:
-                raise BadPicture(str(error), where=frame.source) from error
+            return await self._decoded(await self._studio.frames.fetch())
 
         return await self._again(goal, classify_mockboard)
 
