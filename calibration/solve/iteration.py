@@ -58,6 +58,7 @@ class LevelFit:
     ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
     pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
     stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
+    ``solved``: the iteration at its minimum, from which the level's evidence is taken.
     """
 
     lens: Lens
@@ -75,6 +76,7 @@ class LevelFit:
     sigma_nodal_mm: float | None = None
     nodal_told: bool = False
     nodal_seen_mm: tuple[float, float] | None = None
+    solved: Fit | None = None
 
     @property
     def sigma(self) -> FloatArray:
@@ -302,6 +304,7 @@ class Fit:
             poses={self.problem.views[i].name: (p.R_ct, p.t_ct_m) for i, p in self.state.free.items()},
             iterations=self.iterations,
             sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
+            solved=self,
         )
 
 
