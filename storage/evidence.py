@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from calibration.types import CameraPose, Detection, Quality, Target, TargetKind
 from storage.errors import BadDocument
 
 EVIDENCE_VERSION = 1
+EVIDENCE_FILE = "evidence.json"
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Triple = tuple[Number, Number, Number]
@@ -355,6 +356,11 @@ def _finite(value: Any) -> Any:
 
 def _list(value: tuple[Any, ...] | None) -> list[Any] | None:
     return None if value is None else list(value)
+
+
+def evidence_file(levels: Iterable[Mapping[str, Any]]) -> bytes:
+    """The file that lies beside a lens table: ``{"evidence": 1, "levels": [...]}``, each as the schema says."""
+    return canonical_text({"evidence": EVIDENCE_VERSION, "levels": list(levels)}).encode() + b"\n"
 
 
 def canonical_text(document: Mapping[str, Any]) -> str:

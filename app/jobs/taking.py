@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -37,12 +38,14 @@ _DELAY_BOUND_S = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Taken:
-    """A fresh picture and the pose that the head's encoders told. ``frozen``: it did not change though it had to."""
+    """A fresh picture and the pose that the head's encoders told. ``frozen``: it did not change though it had to.
+    ``sha256``: of the picture file's bytes as they came."""
 
     capture: Capture
     picture: Picture
     head: HeadState
     frozen: bool = False
+    sha256: str = ""
 
 
 @dataclass(slots=True)
@@ -76,6 +79,7 @@ class PictureTaker:
         self._shown: Shown | None = None
         self._last: NDArray[np.float32] | None = None
         self._must_change = False
+        self._sha256 = ""
 
     async def set_level(self, zoom: float, focus: float) -> None:
         """Drive the camera's lens to a level."""
@@ -144,7 +148,7 @@ class PictureTaker:
         self._last, self._must_change = seen, False
         if self._head is None:
             self._head = await self.read_head()
-        return Taken(capture, picture, self._head, frozen)
+        return Taken(capture, picture, self._head, frozen, self._sha256)
 
     async def _prepare(self, capture: Capture) -> None:
         try:
@@ -209,7 +213,9 @@ class PictureTaker:
         async def goal() -> Picture:
             frame = await self._studio.frames.fetch()
             try:
-                return await self._cpu.run(decode_picture, frame.data, expected_size=self._image_size)
+                picture = await self._cpu.run(decode_picture, frame.data, expected_size=self._image_size)
+                self._sha256 = await self._cpu.run(_sha256, frame.data)
+                return picture
             except InvalidInput as error:
                 raise BadPicture(str(error), where=frame.source) from error
 
@@ -226,6 +232,10 @@ class PictureTaker:
             self.counters.real += 1
         else:
             self.counters.virtual += 1
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def lens_values(lens: Lens) -> LensValues:
