@@ -97,7 +97,16 @@ def demo(
         report = RunReport(
             title=f"{job.table.lens} on a simulated studio",
             table=job.table,
-            levels=[LevelReport(j.result, j.truth, j.error, job.pictures.get(_key(j.result), {})) for j in judged],
+            levels=[
+                LevelReport(
+                    j.result,
+                    j.truth,
+                    j.error,
+                    job.pictures.get(_key(j.result), {}),
+                    evidence=job.evidence.get(_key(j.result)),
+                )
+                for j in judged
+            ],
             facts=_facts(use, seconds),
             truth_at=partial(true_lens, truth),
         )

@@ -87,7 +87,12 @@ def job_report(finished: FinishedJob) -> RunReport:
         title=f"{table.lens} on {table.camera}",
         table=table,
         levels=[
-            LevelReport(level, pictures=finished.pictures.get((level.zoom, level.focus), {})) for level in table.levels
+            LevelReport(
+                level,
+                pictures=finished.pictures.get((level.zoom, level.focus), {}),
+                evidence=finished.evidence.get((level.zoom, level.focus)),
+            )
+            for level in table.levels
         ],
         facts=[("method", table.method), ("pictures", f"{real} of the camera, {virtual} renders of the engine")],
     )
