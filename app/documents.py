@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from calibration.camera import target_rotation
 from calibration.errors import CalibrationError
+from calibration.solve.mistakes import Priors
 from calibration.types import CameraPose, Role, Target, TargetKind, TargetPose
 
 _NEAREST_M = 0.01
@@ -119,9 +120,36 @@ class CameraPoseModel(_Loose):
     roll_deg: Finite = 0.0
     sigma_m: NotNegative = 0.0
     sigma_deg: NotNegative = 0.0
+    roll_sigma_deg: NotNegative | None = None
 
     def to_pose(self) -> CameraPose:
-        return CameraPose(self.pivot_m, self.pan_deg, self.tilt_deg, self.roll_deg, self.sigma_m, self.sigma_deg)
+        return CameraPose(
+            self.pivot_m,
+            self.pan_deg,
+            self.tilt_deg,
+            self.roll_deg,
+            self.sigma_m,
+            self.sigma_deg,
+            self.roll_sigma_deg,
+        )
+
+
+class PriorsModel(_Loose):
+    """How large the mistakes of board, head and camera may be, one sigma; 0: there is none."""
+
+    bow_m: NotNegative | None = Field(
+        default=None,
+        description="how far the middle of a board may stand out of its plane; null: 1 % of a hand-held board's side",
+    )
+    pan_scale: NotNegative = Field(default=0.0, description="relative error of the pan encoder")
+    tilt_scale: NotNegative = Field(default=0.0, description="relative error of the tilt encoder")
+    pan_offset_deg: NotNegative = Field(default=0.0, description="error of its zero")
+    tilt_offset_deg: NotNegative = Field(default=0.0, description="error of its zero")
+    roll_offset_deg: NotNegative = Field(default=0.0, description="of the head's roll, or of the sensor in the camera")
+    off_axis_mm: NotNegative = Field(default=0.0, description="the pupil beside the pivot's axis, right and down")
+
+    def to_priors(self) -> Priors:
+        return Priors(**self.model_dump())
 
 
 class PictureModel(_Loose):
@@ -146,6 +174,7 @@ class PictureSet(_Loose):
     pixel_aspect: Positive = 1.0
     transfer: Literal["bt709", "srgb", "linear"] | None = None
     targets: dict[Name, TargetModel] = Field(min_length=1)
+    priors: PriorsModel = PriorsModel()
     pictures: list[PictureModel] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -201,6 +230,10 @@ class JobRequest(_Strict):
     pivot_m: tuple[Finite, Finite, Finite] = Field(description="where the camera's pivot stands")
     pivot_sigma_m: NotNegative = 0.0
     angle_sigma_deg: NotNegative = Field(default=0.0, description="the head's encoders, one sigma")
+    roll_sigma_deg: NotNegative | None = Field(
+        default=None, description="the head's roll from picture to picture, one sigma; null: as the other angles"
+    )
+    priors: PriorsModel = PriorsModel()
     nodal_offset_mm: Finite = Field(default=0.0, description="pivot to entrance pupil; stands unless contradicted")
     nodal_sigma_mm: NotNegative = Field(default=0.0, description="how well it is known; more than 0: only a prior")
     learn_engine: bool = Field(

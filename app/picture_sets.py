@@ -123,7 +123,12 @@ def _solve(
     views = sorted((f for f in found if isinstance(f, View)), key=lambda view: place[view.name])
     left_out = sorted((f for f in found if isinstance(f, LeftOut)), key=lambda out: out.picture)
     try:
-        fit = solve_level(views, described.image_size, pixel_aspect=described.pixel_aspect)
+        fit = solve_level(
+            views,
+            described.image_size,
+            pixel_aspect=described.pixel_aspect,
+            priors=described.priors.to_priors(),
+        )
         held_out = held_out_residuals(fit, views)
         result = level_result(fit, zoom, focus, held_out=held_out, left_out=left_out)
     except CalibrationError as error:
@@ -142,6 +147,7 @@ def _solve(
         described.image_size,
         tuple(views),
         described.pixel_aspect,
+        priors=described.priors.to_priors(),
         left_out=tuple(left_out),
         picture_sha256={view.name: hashes[view.name] for view in views},
         versions=versions(),

@@ -120,6 +120,22 @@ class Interpolation:
 
 
 @dataclass(frozen=True, slots=True)
+class Parallax:
+    """How far a thing at ``near_m`` moves against one at ``far_m`` (px) while the camera pans over ``pan_deg``: with
+    the nodal offset as it was given (``as_given_px``), and by one sigma of the one found (``sigma_px``)."""
+
+    near_m: float
+    far_m: float
+    pan_deg: float
+    as_given_px: float
+    sigma_px: float
+
+    def __post_init__(self) -> None:
+        for name in ("near_m", "far_m", "pan_deg", "as_given_px", "sigma_px"):
+            _not_negative(f"parallax {name}", getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True)
 class EngineValues:
     """What an engine is to be told for a level where that is not the level's own lens: the same quantities, in the
     product's conventions, as the studio profile converts them."""
@@ -154,7 +170,8 @@ class LevelResult:
     ``residual_px``: real corners against the fitted model, RMS per coordinate. ``held_out_px``: the same on pictures
     left out of the fit. ``predicted_overlay_px``: overlay error expected from the covariance. ``engine_overlay_px``:
     corners of the engine's own last render at the coefficients as published. ``engine_values``: what the engine must
-    be told to draw this lens, None where that is the lens itself.
+    be told to draw this lens, None where that is the lens itself. ``parallax``: the operator's no-parallax check as a
+    number, where the nodal offset was measured.
 
     ``scenario`` 1, 2, 3 of the study (chapter 4.3), None where the method knows none. ``seconds``: how long the level
     took. ``reason``: why a level is degraded or failed. ``reasons``: why a quantity of :data:`REASON_KEYS` is None;
@@ -181,6 +198,7 @@ class LevelResult:
     predicted_overlay_px: PixelError | None = None
     engine_overlay_px: PixelError | None = None
     engine_values: EngineValues | None = None
+    parallax: Parallax | None = None
     scenario: int | None = None
     frames: Frames = Frames()
     seconds: float | None = None
@@ -255,6 +273,7 @@ class LevelResult:
         predicted_overlay_px: PixelError | None = None,
         engine_overlay_px: PixelError | None = None,
         engine_values: EngineValues | None = None,
+        parallax: Parallax | None = None,
         scenario: int | None = None,
         frames: Frames | None = None,
         seconds: float | None = None,
@@ -283,6 +302,7 @@ class LevelResult:
             predicted_overlay_px=predicted_overlay_px,
             engine_overlay_px=engine_overlay_px,
             engine_values=engine_values,
+            parallax=parallax,
             scenario=scenario,
             frames=frames or Frames(),
             seconds=seconds,

@@ -81,7 +81,8 @@ class CameraPose:
     """Where the camera's pivot stands (metres) and how it is turned (pan, tilt, roll, intrinsic Z, X, Y, degrees).
 
     Positive pan turns right, positive tilt up, positive roll clockwise seen from behind the camera.
-    ``sigma_m`` (pivot) and ``sigma_deg`` (each angle) are standard deviations; 0 means exact.
+    ``sigma_m`` (pivot) and ``sigma_deg`` (each angle) are standard deviations; 0 means exact. ``roll_sigma_deg``: that
+    of the roll alone, where the head's roll is another matter than its encoders (None: as the other angles).
     """
 
     pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -90,11 +91,18 @@ class CameraPose:
     roll_deg: float = 0.0
     sigma_m: float = 0.0
     sigma_deg: float = 0.0
+    roll_sigma_deg: float | None = None
+
+    @property
+    def roll_sigma(self) -> float:
+        """Standard deviation of the roll, degrees."""
+        return self.sigma_deg if self.roll_sigma_deg is None else self.roll_sigma_deg
 
     def __post_init__(self) -> None:
         _finite("camera pose", *self.pivot_m, self.pan_deg, self.tilt_deg, self.roll_deg)
         _sigma("camera pose sigma_m", self.sigma_m)
         _sigma("camera pose sigma_deg", self.sigma_deg)
+        _sigma("camera pose roll_sigma_deg", self.roll_sigma)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from calibration import tables
 from calibration.errors import CalibrationError
 from calibration.solve.evidence import LevelEvidence, LevelInputs
+from calibration.solve.mistakes import Priors
 from calibration.solve.problem import View
 from calibration.types import CameraPose, Detection, Quality, Target, TargetKind, TargetPose
 from storage.errors import BadDocument
@@ -53,6 +55,19 @@ class CameraPoseDocument(_Document):
     roll_deg: Number
     sigma_m: Number
     sigma_deg: Number
+    roll_sigma_deg: Number | None = None
+
+
+class PriorsDocument(_Document):
+    """How large mistakes of board, encoders and camera may be, standard deviations; bow_m null: by default."""
+
+    bow_m: Number | None = None
+    pan_scale: Number = 0.0
+    tilt_scale: Number = 0.0
+    pan_offset_deg: Number = 0.0
+    tilt_offset_deg: Number = 0.0
+    roll_offset_deg: Number = 0.0
+    off_axis_mm: Number = 0.0
 
 
 class TargetDocument(_Document):
@@ -94,6 +109,7 @@ class InputsDocument(_Document):
     pixel_aspect: Number
     nodal_offset_mm: Number
     nodal_sigma_mm: Number
+    priors: PriorsDocument = PriorsDocument()
     targets: dict[str, TargetDocument]
     pictures: tuple[PictureInputDocument, ...]
     left_out: tuple[LeftOutDocument, ...]
@@ -253,6 +269,7 @@ def _inputs(inputs: LevelInputs) -> dict[str, Any]:
     return {
         "image_size": list(inputs.image_size),
         **_plain(inputs, "pixel_aspect", "nodal_offset_mm", "nodal_sigma_mm"),
+        "priors": asdict(inputs.priors),
         "targets": {view.target_name: _target(view.target) for view in inputs.views},
         "pictures": [_picture(view, inputs.picture_sha256.get(view.name)) for view in inputs.views],
         "left_out": [{"picture": left.picture, "reason": left.reason} for left in inputs.left_out],
@@ -275,7 +292,7 @@ def _target(target: Target) -> dict[str, Any]:
 
 def _picture(view: View, sha256: str | None) -> dict[str, Any]:
     found, pose = view.detection, view.camera_pose
-    angles = ("pan_deg", "tilt_deg", "roll_deg", "sigma_m", "sigma_deg")
+    angles = ("pan_deg", "tilt_deg", "roll_deg", "sigma_m", "sigma_deg", "roll_sigma_deg")
     return {
         "name": view.name,
         "target": view.target_name,
@@ -335,6 +352,7 @@ def _read_inputs(read: EvidenceDocument) -> LevelInputs:
         given.pixel_aspect,
         given.nodal_offset_mm,
         given.nodal_sigma_mm,
+        Priors(**given.priors.model_dump()),
         tuple(tables.LeftOut(left.picture, left.reason) for left in given.left_out),
         {picture.name: picture.sha256 for picture in given.pictures if picture.sha256 is not None},
         given.versions,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -103,6 +104,16 @@ class EngineValuesDocument(_Document):
     nodal_offset_mm: Number
 
 
+class ParallaxDocument(_Document):
+    """How far a near thing moves against a far one while the camera pans, px."""
+
+    near_m: NotNegative
+    far_m: NotNegative
+    pan_deg: NotNegative = Field(description="the whole pan: the horizontal field of view")
+    as_given_px: NotNegative = Field(description="with the nodal offset as it was given")
+    sigma_px: NotNegative = Field(description="by one sigma of the nodal offset found")
+
+
 class LeftOutDocument(_Document):
     """A picture that the fit did not use, and why."""
 
@@ -149,6 +160,9 @@ class LevelDocument(_Document):
     )
     engine_values: EngineValuesDocument | None = Field(
         default=None, description="what the engine is to be told to draw this lens; null: the lens itself"
+    )
+    parallax: ParallaxDocument | None = Field(
+        default=None, description="the operator's no-parallax check, where the nodal offset was measured"
     )
     scenario: Literal[1, 2, 3] | None = Field(default=None, description="as in the study, chapter 4.3")
     frames: FramesDocument | None = None
@@ -233,6 +247,7 @@ def level_to_document(level: tables.LevelResult) -> dict[str, Any]:
         "predicted_overlay_px": _pixel_error(level.predicted_overlay_px),
         "engine_overlay_px": _pixel_error(level.engine_overlay_px),
         **({} if level.engine_values is None else {"engine_values": _engine_values(level.engine_values)}),
+        **({} if level.parallax is None else {"parallax": asdict(level.parallax)}),
         "scenario": None if level.scenario is None else int(level.scenario),
         "frames": {"real": int(level.frames.real), "virtual": int(level.frames.virtual)},
         "seconds": _optional(level.seconds),
@@ -306,6 +321,7 @@ def _level(
             status=tables.LevelStatus(read.status),
             sigma=tables.Sigma(**read.sigma.model_dump()) if read.sigma else tables.Sigma(),
             frames=tables.Frames(**read.frames.model_dump()) if read.frames else tables.Frames(),
+            parallax=tables.Parallax(**read.parallax.model_dump()) if read.parallax else None,
             engine_values=tables.EngineValues(**read.engine_values.model_dump()) if read.engine_values else None,
             left_out=tuple(tables.LeftOut(left.picture, left.reason) for left in read.left_out),
             reason=reason,

@@ -44,6 +44,7 @@ def evidence_of_level(
         task.pixel_aspect,
         task.nodal_offset_mm,
         task.nodal_sigma_mm,
+        task.priors,
         tuple(left_out),
         dict(hashes),
         versions(),

@@ -61,6 +61,8 @@ def level_task(
         pixel_aspect=request.pixel_aspect,
         pivot_sigma_m=request.pivot_sigma_m,
         angle_sigma_deg=request.angle_sigma_deg,
+        roll_sigma_deg=request.roll_sigma_deg,
+        priors=request.priors.to_priors(),
         nodal_offset_mm=nodal[-1] if nodal else request.nodal_offset_mm,
         nodal_sigma_mm=max(_NODAL_CHANGE_MM, request.nodal_sigma_mm) if nodal else request.nodal_sigma_mm,
         guess=guess_from(done, zoom, request),

@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -21,7 +21,7 @@ from calibration.errors import InvalidInput
 from calibration.image import Transfer, decode_picture
 from calibration.lens import Lens
 from calibration.solve.search import Capture, LevelTask, Observation, Source
-from calibration.types import CameraPose, DetectionResult, Picture, Refusal
+from calibration.types import DetectionResult, Picture, Refusal
 from engine_adapters.errors import AdapterError, BadPicture
 from engine_adapters.ports import HeadState, LensValues, Shown
 from engine_adapters.retry import Verdict, classify_head, classify_mockboard, classify_r3, retry
@@ -246,9 +246,7 @@ def lens_values(lens: Lens) -> LensValues:
 def observe(taken: Taken, task: LevelTask, transfer: Transfer, name: str) -> Observation:
     """Find the target in a picture (CPU work). With a prediction that fails, the whole picture is searched."""
     capture, head = taken.capture, taken.head
-    pose = CameraPose(
-        task.pivot_m, head.pan_deg, head.tilt_deg, head.roll_deg, task.pivot_sigma_m, task.angle_sigma_deg
-    )
+    pose = replace(task.pose(head.pan_deg, head.tilt_deg), roll_deg=head.roll_deg)
     if taken.frozen:
         reason = "the output still shows the picture from before the change: it is frozen or delayed beyond measure"
         return Observation(capture.step, Refusal(reason), pose, name)

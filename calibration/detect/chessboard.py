@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
-from calibration.detect.aliasing import LEAST_SHARE, crossing_covariance, edge_variance, unsmoothed_share
-from calibration.detect.corner import (
-    PIXEL_VARIANCE_PX2,
-    WINDOW_SHARE,
-    CornerFit,
-    CornerState,
-    Signal,
-    Windows,
-    cut_windows,
-    edge_softness,
-    fit_corners,
-    guess_sigma,
-)
-from calibration.detect.grid import steps_of
 from calibration.detect.prediction import Prediction
-from calibration.detect.quality import board_centre, grid_scatter, median_sides, score, smooth_residual
+from calibration.detect.quality import board_centre, grid_scatter, score, smooth_residual
+from calibration.detect.refine import Measured, refine
 from calibration.detect.search import Board, cut_too_far, find_board
-from calibration.detect.signal import measure_signal
+from calibration.detect.windows import PIXEL_VARIANCE_PX2
 from calibration.image import Transfer
 from calibration.types import (
     Detection,
@@ -42,15 +26,6 @@ LEAST_MEASURED = 0.8
 """At least this share of the corners must be measured."""
 LARGEST_BLUR_SHARE = 0.27
 """A board whose blur (sigma) exceeds this share of a square's side is refused."""
-_FIRST_HALF_PX = 6
-_SECOND_HALF_PX = 28
-_BAND_SIGMAS = 3.0
-_BAND_PX = 1.5
-_SLOPE_SPAN = 5
-_SOFTNESS_CORNERS = 16
-_GUESS_CORNERS = 12
-_FIRST_ITERATIONS = 8
-_SECOND_ITERATIONS = 6
 
 
 def find_chessboard(
@@ -67,125 +42,16 @@ def find_chessboard(
         return Refusal(found)
     if near is None and cut_too_far(found, picture):
         return Refusal("the board is cut by the frame at a corner: its size cannot be told; turn it into view")
-    signal = measure_signal(picture, found.points_px, found.polarity, transfer)
-    if signal is None:
+    measured = refine(picture, found, transfer)
+    if measured is None:
         return Refusal("the board's two colours cannot be told apart")
-    measured = _measure(signal, found)
-    return _judged(measured, signal, found, target)
+    return _judged(measured, found, target)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Measured:
-    fit: CornerFit
-    start_px: FloatArray
-    side_px: NDArray[np.float64]  # (N,) the shorter of a corner's two steps
-    aliasing_px2: FloatArray  # (N, 2, 2) what pixels that were never smoothed add to the fit's covariance
-
-
-def _measure(signal: Signal, board: Board) -> _Measured:
-    """Fit all corners twice: roughly from the coarse grid, then in windows that suit the blur and edges bent as the
-    grid is.
-    """
-    shape = (board.points_px.shape[0], board.points_px.shape[1])
-    points = board.points_px.reshape(-1, 2)
-    steps = steps_of(board.points_px).reshape(-1, 2, 2)
-    parity = ((-1) ** np.add.outer(np.arange(shape[0]), np.arange(shape[1]))).ravel()
-    count = len(points)
-    start = CornerState(
-        points_px=points,
-        angles=np.arctan2(steps[..., 1], steps[..., 0]),
-        sigma_px=np.ones(count),
-        offset=np.full(count, 0.5),
-        # The quadrant between the two steps lies right of one edge and left of the other: F is negative there.
-        gain=-0.5 * board.polarity * parity,
-    )
-    straight = np.zeros((count, 2))
-    side = float(median_sides(steps).min())
-    some = np.unique(np.linspace(0, count - 1, min(count, _GUESS_CORNERS)).astype(np.int64))
-    half = _half(steps, 24)
-    few = CornerState(*(values[some] for values in _parts(start)))
-    sigma = guess_sigma(cut_windows(signal, few, steps[some], half, stride_px=1 + half // 9), few, 0.5 * side)
-    start = CornerState(points, start.angles, np.full(count, sigma), start.offset, start.gain)
-    half = _half(steps, max(_FIRST_HALF_PX, round(2.5 * sigma), round(3 * board.error_px)))
-    windows = cut_windows(signal, start, steps, half)
-    first = fit_corners(signal, windows, start, straight, iterations=_FIRST_ITERATIONS, tolerance_px=0.05).state
-
-    moved = np.linalg.norm(first.points_px - points, axis=1)
-    side_px = np.linalg.norm(steps, axis=2).min(axis=1)
-    good = moved < 0.3 * side_px
-    sigma = float(np.median(first.sigma_px[good])) if good.any() else sigma
-    again = np.where(good[:, None], first.points_px, points)
-    second_start = CornerState(
-        points_px=again,
-        angles=np.where(good[:, None], first.angles, start.angles),
-        sigma_px=np.where(good, first.sigma_px, sigma),
-        offset=np.where(good, first.offset, start.offset),
-        gain=np.where(good, first.gain, start.gain),
-    )
-    grid = again.reshape(*shape, 2)
-    steps = steps_of(grid).reshape(-1, 2, 2)
-    half = _half(steps, max(_SECOND_HALF_PX, round(3.5 * sigma)))
-    windows = cut_windows(signal, second_start, steps, half, band_px=_BAND_SIGMAS * sigma + _BAND_PX)
-    fit = fit_corners(signal, windows, second_start, _curvature(grid), iterations=_SECOND_ITERATIONS)
-    return _Measured(fit, points, side_px, _aliasing(windows, fit.state, steps, shape, half))
-
-
-def _aliasing(
-    windows: Windows, state: CornerState, steps_px: FloatArray, shape: tuple[int, int], half_px: int
-) -> FloatArray:
-    """(N, 2, 2) px^2 by which edges sharper than the pixels may be off alike over a whole window.
-
-    The residuals do not tell: where all pixels of an edge are cut at the same place, the fit is perfect. The slopes
-    are the grid's, over a few squares: a corner's own angles follow the pixel's step that is in its window.
-    ``shape``: the grid's rows and columns.
-    """
-    blur_variance = float(np.median(state.sigma_px)) ** 2 - PIXEL_VARIANCE_PX2
-    count = len(state.points_px)
-    some = np.unique(np.linspace(0, count - 1, min(count, _SOFTNESS_CORNERS)).astype(np.int64))
-    few = CornerState(*(values[some] for values in _parts(state)))
-    share = unsmoothed_share(edge_softness(windows.of(some), few), blur_variance)
-    if share < LEAST_SHARE:
-        return np.zeros((count, 2, 2))
-    lengths = np.minimum(2 * WINDOW_SHARE * np.linalg.norm(steps_px, axis=2), 2 * half_px)
-    smooth = uniform_filter(steps_px.reshape(*shape, 4), (_SLOPE_SPAN, _SLOPE_SPAN, 0), mode="nearest")
-    steps = smooth.reshape(-1, 2, 2)
-    angles = np.arctan2(steps[..., 1], steps[..., 0])
-    return share * crossing_covariance(angles, edge_variance(angles, lengths))
-
-
-def _parts(state: CornerState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    return state.points_px, state.angles, state.sigma_px, state.offset, state.gain
-
-
-def _half(steps_px: FloatArray, largest_px: int) -> int:
-    """Half the side of a square of pixels that holds every corner's window, at most ``largest_px``."""
-    reach = WINDOW_SHARE * np.abs(steps_px).sum(axis=1).max()
-    return int(max(min(np.ceil(reach), largest_px), 3))
-
-
-def _curvature(grid_px: FloatArray) -> FloatArray:
-    """(N, 2) 1/px: how the grid's lines bend at each point, along columns and along rows, from second differences.
-
-    A line's ends take the value of the point beside them; positive bends towards the edge's normal (-sin, cos).
-    """
-    bends = np.zeros(grid_px.shape)
-    for which, axis in ((0, 1), (1, 0)):
-        line = np.moveaxis(grid_px, axis, 0)
-        if len(line) < 3:
-            continue
-        second = line[2:] - 2 * line[1:-1] + line[:-2]
-        along = (line[2:] - line[:-2]) / 2
-        length = np.linalg.norm(along, axis=-1)
-        bend = (along[..., 0] * second[..., 1] - along[..., 1] * second[..., 0]) / length**3
-        bend = np.concatenate([bend[:1], bend, bend[-1:]])
-        bends[..., which] = np.moveaxis(bend, 0, axis)
-    return bends.reshape(-1, 2)
-
-
-def _judged(measured: _Measured, signal: Signal, board: Board, target: Target) -> DetectionResult:
+def _judged(measured: Measured, board: Board, target: Target) -> DetectionResult:
     """The detection with the corners that can be trusted, or why there are too few of them."""
     columns, rows = target.grid
-    fit = measured.fit
+    fit, signal = measured.fit, measured.signal
     state = fit.state
     total = columns * rows
     places = np.column_stack([np.tile(np.arange(columns), rows), np.repeat(np.arange(rows), columns)])

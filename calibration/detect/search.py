@@ -11,8 +11,9 @@ import numpy as np
 from calibration.detect.grid import Grid, find_grids, mean_steps, predict_missing, steps_of
 from calibration.detect.prediction import Prediction
 from calibration.detect.quality import median_sides
-from calibration.detect.saddle import Gray, find_saddles, reduce_picture
+from calibration.detect.saddle import Gray, Saddles, find_saddles, reduce_picture
 from calibration.detect.signal import surrounded
+from calibration.detect.windows import Reduced
 from calibration.types import FloatArray, Picture
 
 _FIRST_WIDTH_PX = 1000
@@ -23,6 +24,8 @@ _LEAST_PRESENT = 0.8
 _LEAST_REPORTED = 0.15
 _MARGIN_SIGMAS = 4.0
 _MATCH_SIGMAS = 5.0
+_FOLLOWED_SHARE = 0.9
+"""Of the expected corners that must be seen before the search for a grid is spared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,13 +33,15 @@ class Board:
     """The asked grid as the coarse search saw it, in pixels of the picture.
 
     ``points_px`` (rows, columns, 2), every place filled (from its neighbours where not seen); ``polarity`` as in
-    :class:`Grid`; ``whole``: the outer squares lie inside the picture; ``error_px`` how far a point may be off.
+    :class:`Grid`; ``whole``: the outer squares lie inside the picture; ``error_px`` how far a point may be off;
+    ``plane`` the reduced channel it was found in, in coded values.
     """
 
     points_px: FloatArray
     polarity: int
     whole: bool
     error_px: float
+    plane: Reduced
 
 
 def find_board(
@@ -54,10 +59,14 @@ def find_board(
     others: list[Grid] = []
     least = max(4, round(_LEAST_REPORTED * size[0] * size[1]))
     for factor, gray in _levels(part, colours, near, size):
+        saddles = find_saddles(gray)
+        plane = Reduced(gray, factor, (int(corner[0]), int(corner[1])), 1.0, 1.0)
+        if near is not None:
+            followed = follow(saddles, plane, near, size)
+            if followed is not None:
+                return _board(followed, picture, 0.3 * factor, plane)
         grids = [
-            grid
-            for grid in find_grids(find_saddles(gray), least, max(size) + 2)
-            if factor == 1 or _step(grid) > _SMALLEST_STEP_PX
+            grid for grid in find_grids(saddles, least, max(size) + 2) if factor == 1 or _step(grid) > _SMALLEST_STEP_PX
         ]
         boards: list[Board] = []
         for grid in grids:
@@ -67,13 +76,53 @@ def find_board(
             if oriented is None or oriented.present < _LEAST_PRESENT * size[0] * size[1]:
                 others.append(full)
                 continue
-            board = _board(oriented, picture, error_px=0.3 * factor)
+            board = _board(oriented, picture, 0.3 * factor, plane)
             if near is None or _fits(board, near):
                 boards.append(board)
         result = _choose(boards, size, near)
         if result is not None:
             return result
     return _reason(others, size, picture, near)
+
+
+def follow(saddles: Saddles, plane: Reduced, near: Prediction, size: tuple[int, int]) -> Grid | None:
+    """The expected grid with its points at the saddles beside them, in pixels of the picture; None where in doubt.
+
+    Only where the prediction tells one corner from the next: a common shift of the board is taken off first, then every
+    point must be within a quarter of a square of a saddle whose bright diagonal turns as the board's does.
+    """
+    expected = (near.points_px + 0.5 - np.array(plane.origin_px)) / plane.pixel_px - 0.5
+    steps = steps_of(expected.reshape(size[1], size[0], 2)).reshape(-1, 2, 2)
+    side = np.linalg.norm(steps, axis=2).min(axis=1)
+    least = _FOLLOWED_SHARE * len(expected)
+    if _MARGIN_SIGMAS * near.sigma_px / plane.pixel_px > 0.5 * float(np.median(side)) or len(saddles.points) < least:
+        return None
+    # The quadrant between the two steps is bright where the bright diagonal runs along their sum.
+    diagonal = steps.sum(axis=1)
+    parity = (-1.0) ** np.add.outer(np.arange(size[1]), np.arange(size[0])).ravel()
+    away = saddles.points[None, :, :] - expected[:, None, :]
+    distance = np.hypot(away[..., 0], away[..., 1])
+    turned = saddles.phase[None, :] - np.arctan2(diagonal[:, 1], diagonal[:, 0])[:, None]
+    sign = np.cos(2 * turned) * parity[:, None]
+    reach = np.minimum(_MARGIN_SIGMAS * near.sigma_px / plane.pixel_px + 0.5, 0.5 * side)
+    index = np.arange(len(expected))
+    for polarity in (1, -1):
+        possible = np.where(sign * polarity > 0.5, distance, np.inf)
+        nearest = possible.argmin(axis=1)
+        close = possible[index, nearest] < reach
+        if close.sum() < least:
+            continue
+        shift = np.median(away[index, nearest][close], axis=0)
+        rest = np.where(sign * polarity > 0.5, np.hypot(away[..., 0] - shift[0], away[..., 1] - shift[1]), np.inf)
+        nearest = rest.argmin(axis=1)
+        close = rest[index, nearest] < 0.25 * side
+        if close.sum() < least:
+            continue
+        points = np.where(close[:, None], saddles.points[nearest], np.nan)
+        amplitude = float(np.median(saddles.amplitude[nearest[close]]))
+        full = (points.reshape(size[1], size[0], 2) + 0.5) * plane.pixel_px - 0.5 + np.array(plane.origin_px)
+        return Grid(full, polarity, amplitude)
+    return None
 
 
 def upright(grid: Grid, size: tuple[int, int], near: Prediction | None = None) -> Grid | None:
@@ -179,7 +228,7 @@ def _open_sides(points_px: FloatArray, picture: Picture) -> tuple[int, int]:
     return sum(share < 0.5 for share in left_right), sum(share < 0.5 for share in top_bottom)
 
 
-def _board(grid: Grid, picture: Picture, error_px: float) -> Board:
+def _board(grid: Grid, picture: Picture, error_px: float, plane: Reduced) -> Board:
     points = grid.points
     while not np.isfinite(points).all():
         expected = predict_missing(points)
@@ -187,7 +236,7 @@ def _board(grid: Grid, picture: Picture, error_px: float) -> Board:
         if np.isfinite(filled).sum() == np.isfinite(points).sum():
             break
         points = filled
-    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px)
+    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px, plane)
 
 
 def _choose(boards: list[Board], size: tuple[int, int], near: Prediction | None) -> Board | str | None:

@@ -1,7 +1,9 @@
 """The evidence of a level: what its numbers rest on, whether the model suits the pictures, and how to solve it again.
 
 All figures come from the fit at its minimum, from whitened residuals r and Jacobian J (priors included), with
-C = (J^T J)^-1 and leverages h_i = J_i C J_i^T:
+C = (J^T J)^-1 and leverages h_i = J_i C J_i^T. The unknowns of single pictures are eliminated: with S = J_s - J_o
+C_o^-1 J_o^T J_s, the shared unknowns' Jacobian less what the pictures' own ones follow, J_i C J_j^T is
+S_i C_s S_j^T, plus J_oi C_o^-1 J_oj^T within a picture (Triggs et al., Bundle adjustment, 2000, section 6):
 
 - A picture's chi2 is the sum of its r^2, with 2 n - sum(h) degrees of freedom.
 - A term that the model lacks, with whitened derivatives E, is tested by its score (Rao 1948), which for least squares
@@ -16,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +27,9 @@ from scipy.special import chdtrc, ndtr
 from calibration.compare import Overlay, grid_pixels, predicted_overlay
 from calibration.errors import InvalidInput
 from calibration.lens import LENS_PARAMETERS, Lens
-from calibration.solve.iteration import Fit, LevelFit
+from calibration.solve.iteration import Fit, LevelFit, per_unknown
 from calibration.solve.level import held_out_residuals, solve_level
+from calibration.solve.mistakes import Priors
 from calibration.solve.outcome import level_result, pixel_error
 from calibration.solve.problem import LENS_COUNT, View
 from calibration.tables import LeftOut, LevelResult, PixelError
@@ -59,6 +62,7 @@ class LevelInputs:
     pixel_aspect: float = 1.0
     nodal_offset_mm: float = 0.0
     nodal_sigma_mm: float = 0.0
+    priors: Priors = field(default_factory=Priors)
     left_out: tuple[LeftOut, ...] = ()
     picture_sha256: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -221,6 +225,7 @@ def solve_again(inputs: LevelInputs) -> LevelResult:
         pixel_aspect=inputs.pixel_aspect,
         nodal_offset_mm=inputs.nodal_offset_mm,
         nodal_sigma_mm=inputs.nodal_sigma_mm,
+        priors=inputs.priors,
     )
     held_out = held_out_residuals(fit, inputs.views)
     return level_result(fit, inputs.zoom, inputs.focus, held_out=held_out, left_out=inputs.left_out)
@@ -228,15 +233,19 @@ def solve_again(inputs: LevelInputs) -> LevelResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Minimum:
-    """The fit at its minimum, whitened, points that count only: residuals (n, 2), Jacobian (n, 2, P), rays (n, 2),
-    the whole normal matrix's inverse (P, P), leverages (n, 2), and each point's picture and number."""
+    """The fit at its minimum, whitened, points that count only: residuals (n, 2); Jacobians ``shared`` (n, 2, S), the
+    pictures' own unknowns already taken off, and ``own`` (n, 2, 6); covariances of the shared unknowns (S, S) and of
+    each picture's own ones were the shared ones known (V, 6, 6); rays (n, 2), leverages (n, 2), each point's picture
+    and number."""
 
     whiten: FloatArray
     raw_px: FloatArray
     residual: FloatArray
-    jacobian: FloatArray
+    shared: FloatArray
+    own: FloatArray
+    shared_covariance: FloatArray
+    own_covariance: FloatArray
     rays: FloatArray
-    inverse: FloatArray
     leverage: FloatArray
     view: NDArray[np.int64]
     point: NDArray[np.int64]
@@ -244,40 +253,57 @@ class _Minimum:
     @classmethod
     def of(cls, solved: Fit) -> _Minimum:
         problem, used = solved.problem, solved.used
-        evaluation = problem.evaluate(solved.state)
+        at = solved.at_minimum()
+        evaluation, normal = at.evaluation, at.normal
+        view = problem.view_of[used]
         total_px2 = solved.detector_px2[used] + np.eye(2) * solved.floor_px**2
         whiten = np.linalg.inv(np.linalg.cholesky(total_px2))
-        raw = evaluation.residual_px[used]
-        J = whiten @ evaluation.jacobian[used]
-        flat, prior = J.reshape(-1, J.shape[-1]), evaluation.prior_jacobian
-        normal = flat.T @ flat + prior.T @ prior
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-        points = np.concatenate([problem.camera_points(solved.state, i)[0] for i in range(len(problem.views))])[used]
-        return cls(
+        raw, own = evaluation.residual_px[used], whiten @ evaluation.own[used]
+        own_covariance = np.asarray(np.linalg.pinv(normal.C, hermitian=True))
+        follow = own_covariance @ np.swapaxes(normal.B, 1, 2)  # (V, 6, S)
+        shared = whiten @ evaluation.shared[used] - np.einsum("nio,nos->nis", own, follow[view])
+        points = problem.geometry.camera_points(solved.state)[used]
+        minimum = cls(
             whiten,
             raw,
             (whiten @ raw[..., None])[..., 0],
-            J,
+            shared,
+            own,
+            normal.shared_covariance(),
+            own_covariance,
             points[:, :2] / points[:, 2:],
-            np.asarray(inverse),
-            np.einsum("nij,jk,nik->ni", J, inverse, J),
-            problem.view_of[used],
+            np.empty(0),
+            view,
             np.concatenate([view.detection.point_ids for view in problem.views])[used],
         )
+        every = np.arange(len(view))
+        return replace(minimum, leverage=minimum.brought_by_fit(every, every))
+
+    def brought_by_fit(self, a: NDArray[np.int64], b: NDArray[np.int64]) -> FloatArray:
+        """J_a C J_b^T of pairs of points of the same picture, each coordinate with its like: (pairs, 2)."""
+        shared = np.einsum("nis,st,nit->ni", self.shared[a], self.shared_covariance, self.shared[b], optimize=True)
+        own = np.einsum("nio,nop,nip->ni", self.own[a], self.own_covariance[self.view[a]], self.own[b], optimize=True)
+        return np.asarray(shared + own)
+
+    def followed(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the unknowns make of whitened derivatives ``E`` (n, 2, m): C_s S^T E (S, m) for the shared ones, and
+        J C J^T E (n, 2, m)."""
+        shared = self.shared_covariance @ np.einsum("nis,nim->sm", self.shared, E)
+        each = np.zeros((len(self.own_covariance), self.own.shape[-1], E.shape[-1]))
+        np.add.at(each, self.view, np.einsum("nio,nim->nom", self.own, E))
+        each = self.own_covariance @ each
+        return shared, self.shared @ shared + np.einsum("nio,nom->nim", self.own, each[self.view])
 
 
 def _covariance(fit: LevelFit, minimum: _Minimum) -> tuple[tuple[str, ...], FloatArray]:
     column = fit.solved.problem.nodal_column if fit.solved is not None else -1
     if column < 0 or fit.untold:
         return LENS_PARAMETERS, fit.covariance
-    lens, h = fit.lens, fit.lens.half_width
-    T = np.zeros((6, 6))
-    T[0, 0], T[1, 1], T[2, 2] = lens.f_px, 1 / h**2, 1 / h**4
-    T[1, 0], T[2, 0] = 2 * lens.k1, 4 * lens.k2
-    T[3, 3] = T[4, 4] = T[5, 5] = 1.0
     rows = [*range(LENS_COUNT), column]
-    return (*LENS_PARAMETERS, "nodal_offset_mm"), T @ minimum.inverse[np.ix_(rows, rows)] @ T.T
+    T = np.eye(LENS_COUNT + 1)
+    T[:LENS_COUNT, :LENS_COUNT] = per_unknown(fit.lens)
+    covariance = T @ minimum.shared_covariance[np.ix_(rows, rows)] @ T.T
+    return (*LENS_PARAMETERS, "nodal_offset_mm"), covariance
 
 
 def _noise(fit: LevelFit, solved: Fit, minimum: _Minimum) -> Noise:
@@ -306,7 +332,7 @@ def _pictures(fit: LevelFit, minimum: _Minimum, held_out: Mapping[str, FloatArra
 
 def _outliers(solved: Fit) -> Sequence[Outlier]:
     problem = solved.problem
-    residual = problem.evaluate(solved.state, jacobian=False).residual_px
+    residual = problem.residuals(solved.state)
     ids = np.concatenate([view.detection.point_ids for view in problem.views])
     total_px2 = solved.detector_px2 + np.eye(2) * solved.floor_px**2
     told = []
@@ -378,23 +404,22 @@ def _misfit(fit: LevelFit, minimum: _Minimum) -> Misfit:
 
 def _score(name: str, fit: LevelFit, minimum: _Minimum, extra_px: FloatArray, term: _Term | None) -> Test:
     """The score test of extra derivatives (n, 2, m) px; with the term's function also how much it would change."""
-    E = (minimum.whiten @ extra_px).reshape(-1, extra_px.shape[-1])
-    E_scale = np.linalg.norm(E, axis=0)
+    E = minimum.whiten @ extra_px
+    E_scale = np.linalg.norm(E, axis=(0, 1))
     E = E / np.maximum(E_scale, 1e-300)
-    J = minimum.jacobian.reshape(-1, minimum.jacobian.shape[-1])
-    follow = minimum.inverse @ (J.T @ E)
-    information = E.T @ (E - J @ follow)
-    score = E.T @ minimum.residual.ravel()
+    follow, explained = minimum.followed(E)
+    information = np.einsum("nik,nim->km", E, E - explained)
+    score = np.einsum("nim,ni->m", E, minimum.residual)
     kept = np.linalg.eigvalsh(information)
     if not kept[0] > 1e-9:
         # The other unknowns do all that this term could do: nothing can be said about it.
-        return Test(name, 0.0, E.shape[1], 1.0, None if term is None else 0.0)
+        return Test(name, 0.0, E.shape[-1], 1.0, None if term is None else 0.0)
     amount = -np.linalg.solve(information, score)
     statistic = float(-score @ amount)
     size_px = None
     if term is not None:
         size_px = _moved_px(fit.lens, term(fit.lens, _grid_rays(fit.lens)) / E_scale, amount, -follow @ amount)
-    return Test(name, statistic, E.shape[1], float(chdtrc(E.shape[1], statistic)), size_px)
+    return Test(name, statistic, E.shape[-1], float(chdtrc(E.shape[-1], statistic)), size_px)
 
 
 def _grid_rays(lens: Lens) -> FloatArray:
@@ -403,9 +428,7 @@ def _grid_rays(lens: Lens) -> FloatArray:
 
 def _moved_px(lens: Lens, term: FloatArray, amount: FloatArray, others: FloatArray) -> float:
     """Largest distance on the grid by which the lens moves with ``amount`` of ``term`` and what the others then do."""
-    J, h = lens.jacobian_parameters(_grid_rays(lens)), lens.half_width
-    per_log_f = lens.f_px * J[..., 0] + 2 * lens.k1 * J[..., 1] + 4 * lens.k2 * J[..., 2]
-    per = np.stack([per_log_f, J[..., 1] / h**2, J[..., 2] / h**4, J[..., 3], J[..., 4]], axis=-1)
+    per = lens.jacobian_parameters(_grid_rays(lens)) @ per_unknown(lens)
     return float(np.nanmax(np.linalg.norm(term @ amount + per @ others[:LENS_COUNT], axis=-1)))
 
 
@@ -430,7 +453,6 @@ def _neighbours(fit: LevelFit, minimum: _Minimum) -> tuple[float, Test]:
         return 0.0, Test(name, 0.0, 1, 1.0)
     a, b = np.array(first), np.array(second)
     products = minimum.residual[a] * minimum.residual[b]
-    by_fit = -np.einsum("nij,jk,nik->ni", minimum.jacobian[a], minimum.inverse, minimum.jacobian[b])
-    excess = float(np.sum(products - by_fit))
+    excess = float(np.sum(products + minimum.brought_by_fit(a, b)))
     z = excess / math.sqrt(products.size)
     return excess / products.size, Test(name, z * abs(z), 1, float(ndtr(-z)))

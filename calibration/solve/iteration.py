@@ -1,35 +1,52 @@
 """The iteration of a level's fit: damped Gauss-Newton, robust start, noise floor, outliers, and what it leaves.
 
-Levenberg-Marquardt damping on whitened residuals. The variance of a point is its detection's covariance plus one
-common floor (``floor_px``) for what the model does not describe (a board that is not flat, an edge that is not
-straight): the floor is chosen so that chi2 equals the degrees of freedom (variance component estimation), so that
+Levenberg-Marquardt damping on whitened residuals; the unknowns of single pictures are eliminated from the normal
+equations, so that many pictures cost little more than few. The variance of a point is its detection's covariance plus
+one common floor (``floor_px``) for what the model does not describe (an edge that is not straight, a sharpened
+photograph): the floor is chosen so that chi2 equals the degrees of freedom (variance component estimation), so that
 uncertainties stay true where the detector's own are too small to be.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import NotConverged, NotEnoughData
 from calibration.lens import Lens
-from calibration.solve.problem import LENS_COUNT, PRIOR_NODAL_MM, Evaluation, Problem, State, View
-from calibration.solve.start import FreePoses
+from calibration.solve.mistakes import Mistake, Priors
+from calibration.solve.normal import NormalEquations
+from calibration.solve.problem import (
+    LENS_COUNT,
+    OWN,
+    PRIOR_NODAL_MM,
+    Evaluation,
+    FreePoses,
+    Problem,
+    State,
+    View,
+)
+from calibration.solve.rotation import rotation_log
+from calibration.tables import Parallax
 from calibration.types import FloatArray
 
 _ITERATIONS = 200
 # Boards that all face the camera leave a valley along which the fit creeps; all else needs ten to twenty.
 _CONVERGED_PX = 1e-7
 # A step that moves no point by more than this is the end: five orders below the best detector.
+_ROUGH_PX = 1e-3
+# The same between the rounds in which floor and outliers are still sought.
 _OUTLIER_CHI2 = 25.0
 # Squared distance over its variance, 2 degrees of freedom: 5 sigma, one point in 270,000.
 _VIEW_OUTLIERS = 0.3
 # A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
 _FLOOR_ROUNDS = 6
+_PLACE = ("place across", "place in depth", "height")
+_TURN = ("turn about its columns", "turn about its rows", "turn in its plane")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +69,14 @@ class LevelFit:
 
     ``covariance`` (5, 5) is of (f_px, k1, k2, sx, sy) as :data:`calibration.lens.LENS_PARAMETERS`. ``rms_px`` is per
     coordinate, ``max_px`` a distance, both over the points that counted. ``floor_px`` see the module.
-    ``outliers``: (picture, point number, distance px); ``dropped``: pictures left out with their reasons.
-    ``poses``: camera from target (R, t in metres) of each free picture, by name. ``untold`` names the quantities
-    (``k1``, ``k2``, ``center_shift_px``) that the pictures do not show: they are held at 0 in ``lens``, while
-    ``covariance`` is still that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed
-    pictures tell and its sigma, None without such pictures; ``nodal_told``: it contradicts the one given, so that it
-    stands in ``lens`` (else the given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held.
-    ``solved``: the iteration at its minimum, from which the level's evidence is taken.
+    ``outliers``: (picture, point number, distance px); ``dropped``: pictures left out with their reasons. ``poses``:
+    camera from target (R, t in metres) of each free picture, by name. ``untold`` names the quantities (``k1``, ``k2``,
+    ``center_shift_px``) that the pictures do not show: they are held at 0 in ``lens``, while ``covariance`` is still
+    that of the fit with all of them free. ``nodal_seen_mm``: the nodal offset that posed pictures tell and its sigma,
+    None without such pictures; ``nodal_told``: it contradicts the one given, so that it stands in ``lens`` (else the
+    given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held. ``parallax``: the operator's check,
+    where it was told. ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns
+    with ``priors``. ``solved``: the iteration at its minimum, from which the level's evidence is taken.
     """
 
     lens: Lens
@@ -74,8 +92,11 @@ class LevelFit:
     iterations: int
     untold: tuple[str, ...] = ()
     sigma_nodal_mm: float | None = None
+    mistakes: tuple[Mistake, ...] = ()
+    priors: Priors = field(default_factory=Priors)
     nodal_told: bool = False
     nodal_seen_mm: tuple[float, float] | None = None
+    parallax: Parallax | None = None
     solved: Fit | None = None
 
     @property
@@ -90,6 +111,15 @@ class LevelFit:
         return math.degrees(2 * half / (self.lens.f_px**2 + half**2)) * float(self.sigma[0])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """A fit's residuals and Jacobians, its whitening (see :meth:`Fit._whitening`) and its normal equations."""
+
+    evaluation: Evaluation
+    whiten: FloatArray
+    normal: NormalEquations
+
+
 class Fit:
     """One run of the iteration over one set of views."""
 
@@ -102,34 +132,57 @@ class Fit:
         lens_free: bool = True,
         held: tuple[str, ...] = (),
         nodal_sigma_mm: float = PRIOR_NODAL_MM,
+        priors: Priors | None = None,
+        lifted: Mapping[str, FloatArray] | None = None,
     ) -> None:
-        self.problem = Problem(views, lens, poses, lens_free=lens_free, held=held, nodal_sigma_mm=nodal_sigma_mm)
+        self.priors = priors or Priors()
+        self.problem = Problem(
+            views,
+            lens,
+            poses,
+            lens_free=lens_free,
+            held=held,
+            nodal_sigma_mm=nodal_sigma_mm,
+            priors=self.priors,
+            lifted=lifted,
+        )
         self.state: State = self.problem.state
         self.detector_px2 = np.concatenate([v.detection.covariance_px2 for v in views])
         self.used = np.ones(len(self.detector_px2), dtype=bool)
         self.floor_px = 0.0
         self.iterations = 0
+        ends = np.cumsum([len(v.detection.points_px) for v in views])
+        self._rows = [
+            slice(int(end) - len(v.detection.points_px), int(end)) for v, end in zip(views, ends, strict=True)
+        ]
 
     def free_poses(self) -> FreePoses:
         """The poses that were free, as they now stand."""
-        return {index: (pose.R_ct, pose.t_ct_m) for index, pose in self.state.free.items()}
+        return {int(i): (self.state.R[i], self.state.t[i]) for i in np.flatnonzero(self.problem.own_count == OWN)}
 
-    def run(self) -> None:
-        """Robust start, then rounds of: floor from the residuals, outliers by it, fit."""
-        self.floor_px = 1.0
-        self.iterate(robust=True)
+    def run(self, after: Fit | None = None) -> None:
+        """Robust start, then rounds of: floor from the residuals, outliers by it, fit.
+
+        ``after``: a fit of the same pictures that differs by a few unknowns; its floor and outliers are the start.
+        """
+        if after is None:
+            self.floor_px = 1.0
+            self.iterate(robust=True)
+        else:
+            self.floor_px, self.used = after.floor_px, after.used.copy()
+            self.iterate(robust=False, settled_px=_ROUGH_PX)
         for _ in range(_FLOOR_ROUNDS):
             before = self.floor_px, self.used.copy()
-            residual = self.problem.evaluate(self.state, jacobian=False).residual_px
+            residual = self.problem.residuals(self.state)
             self.floor_px = self._robust_floor(residual)
             self._reject(residual)
-            self.iterate(robust=False)
+            self.iterate(robust=False, settled_px=_ROUGH_PX)
             if abs(self.floor_px - before[0]) <= 0.01 * before[0] + 1e-6 and np.array_equal(self.used, before[1]):
                 break
         self.floor_px = self._floor_for_chi2()
         self.iterate(robust=False)
 
-    def iterate(self, *, robust: bool) -> None:
+    def iterate(self, *, robust: bool, settled_px: float = _CONVERGED_PX) -> None:
         """Gauss-Newton with Levenberg-Marquardt damping until no point moves; raises NotConverged."""
         damping = 1e-4
         whiten = self._whitening()
@@ -140,13 +193,10 @@ class Fit:
         moved = math.inf
         for _ in range(_ITERATIONS):
             self.iterations += 1
-            matrix, gradient = self._normal_equations(evaluation, whiten, robust)
+            normal = self._normal(evaluation, whiten, robust)
             for _ in range(12):
-                scale = np.diag(matrix).copy()
-                scale[scale <= 0] = 1.0
-                try:
-                    step = np.asarray(np.linalg.solve(matrix + damping * np.diag(scale), -gradient), dtype=np.float64)
-                except np.linalg.LinAlgError:
+                step = normal.solved(damping)
+                if step is None:
                     damping = max(damping, 1e-6) * 10
                     continue
                 trial = self.problem.stepped(self.state, step)
@@ -162,46 +212,45 @@ class Fit:
             gained = cost - trial_cost
             self.state, evaluation, cost = trial, trial_evaluation, trial_cost
             damping = max(damping / 10, 1e-12)
-            if moved < _CONVERGED_PX or (robust and gained < 1e-6 * (1 + cost)):
+            if moved < settled_px or (robust and gained < 1e-3 * (1 + cost)):
                 return
         if moved > 1e-3 and not robust:
             raise NotConverged("the level's fit", _ITERATIONS, moved)
 
     def _whitening(self) -> FloatArray:
-        """(N, 2, 2) matrices W with W^T W = inverse covariance of each point; zero for points that do not count."""
-        covariance = self.detector_px2 + np.eye(2) * self.floor_px**2
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-        return np.asarray(np.where(self.used[:, None, None], whiten, 0.0))
+        """(N, 3): w11, w21, w22 of lower triangles W with W^T W = inverse covariance of each point; zero for points
+        that do not count. From the Cholesky factor of the 2 x 2 covariance in closed form."""
+        covariance = self.detector_px2
+        uu, uv, vv = covariance[:, 0, 0] + self.floor_px**2, covariance[:, 0, 1], covariance[:, 1, 1] + self.floor_px**2
+        l11 = np.sqrt(uu)
+        l21 = uv / l11
+        l22 = np.sqrt(vv - l21 * l21)
+        whiten = np.column_stack([1 / l11, -l21 / (l11 * l22), 1 / l22])
+        return np.where(self.used[:, None], whiten, 0.0)
 
     def _robust_weights(self, whitened: FloatArray) -> FloatArray:
         # Cauchy: far points pull ever less, so a start with a few wrong ones still converges.
         return np.asarray(1.0 / (1.0 + np.sum(whitened**2, axis=1) / 4.0))
 
     def _cost(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> float:
-        whitened = (whiten @ evaluation.residual_px[..., None])[..., 0]
-        whitened = np.where(self.used[:, None], whitened, 0.0)
+        whitened = _whitened(whiten, evaluation.residual_px, self.used)
         squares = np.sum(whitened**2, axis=1)
         data = float(np.sum(4.0 * np.log1p(squares / 4.0))) if robust else float(np.sum(squares))
-        return data + float(np.sum(evaluation.prior_residual**2))
+        priors = float(np.sum(evaluation.prior_residual**2)) + float(np.sum(evaluation.own_prior_residual**2))
+        return data + priors
 
-    def _normal_equations(
-        self, evaluation: Evaluation, whiten: FloatArray, robust: bool
-    ) -> tuple[FloatArray, FloatArray]:
-        whitened = (whiten @ evaluation.residual_px[..., None])[..., 0][self.used]
-        J = (whiten @ evaluation.jacobian)[self.used]
+    def _normal(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> NormalEquations:
+        whitened = _whitened(whiten, evaluation.residual_px, self.used)
         if robust:
             root = np.sqrt(self._robust_weights(whitened))
-            whitened, J = whitened * root[:, None], J * root[:, None, None]
-        flat = J.reshape(-1, J.shape[-1])
-        prior = evaluation.prior_jacobian
-        matrix = flat.T @ flat + prior.T @ prior
-        return matrix, flat.T @ whitened.ravel() + prior.T @ evaluation.prior_residual
+            whitened, whiten = whitened * root[:, None], whiten * root[:, None]
+        shared = _whitened(whiten, evaluation.shared, self.used)
+        own = _whitened(whiten, evaluation.own, self.used) if self.problem.own_count.any() else None
+        return NormalEquations.of(self._rows, self.problem.own_count, evaluation, whitened, shared, own)
 
     def _degrees_of_freedom(self) -> int:
         # Unknowns with a prior bring one observation each, so they take nothing from the points.
-        priors = self.problem.evaluate(self.state, jacobian=False).prior_residual.size
-        with_prior = priors - self.problem.weak_priors
-        return max(2 * int(self.used.sum()) - (self.problem.count - with_prior), 1)
+        return max(2 * int(self.used.sum()) - (self.problem.count - self.problem.prior_count), 1)
 
     def _robust_floor(self, residual: FloatArray) -> float:
         """The floor that explains the residuals but for gross errors.
@@ -220,7 +269,7 @@ class Fit:
 
     def _floor_for_chi2(self) -> float:
         """The floor at which chi2 equals the degrees of freedom (0 if it is below them without one); bisection."""
-        residual = self.problem.evaluate(self.state, jacobian=False).residual_px[self.used]
+        residual = self.problem.residuals(self.state)[self.used]
         covariance = self.detector_px2[self.used]
         goal = self._degrees_of_freedom()
 
@@ -249,7 +298,7 @@ class Fit:
 
     def worst_view(self) -> tuple[int, str] | None:
         """(index, reason) of the picture with most outliers, if it is to be dropped."""
-        residual = self.problem.evaluate(self.state, jacobian=False).residual_px
+        residual = self.problem.residuals(self.state)
         worst: tuple[int, float] | None = None
         for index in range(len(self.problem.views)):
             share = 1 - float(np.mean(self.used[self.problem.view_of == index]))
@@ -260,16 +309,20 @@ class Fit:
         distance = np.median(np.linalg.norm(residual[self.problem.view_of == worst[0]], axis=1))
         return worst[0], f"{worst[1]:.0%} of its points disagree with the other pictures (median {distance:.1f} px)"
 
+    def at_minimum(self) -> Minimum:
+        """Everything of the fit as it now stands."""
+        evaluation, whiten = self.problem.evaluate(self.state), self._whitening()
+        return Minimum(evaluation, whiten, self._normal(evaluation, whiten, robust=False))
+
     def result(self, dropped: tuple[tuple[str, str], ...]) -> LevelFit:
-        evaluation = self.problem.evaluate(self.state)
-        whiten = self._whitening()
-        matrix, _ = self._normal_equations(evaluation, whiten, False)
-        lens = self.state.lens
-        inverse = _inverse(matrix)
-        covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
+        at = self.at_minimum()
+        evaluation, whiten, lens = at.evaluation, at.whiten, self.state.lens
+        inverse = at.normal.shared_covariance()
+        T = per_unknown(lens)
+        covariance = T @ inverse[:LENS_COUNT, :LENS_COUNT] @ T.T
         column = self.problem.nodal_column
         residual = evaluation.residual_px
-        whitened = (whiten @ residual[..., None])[..., 0]
+        whitened = _whitened(whiten, residual, self.used)
         views, outliers = [], []
         for index, view in enumerate(self.problem.views):
             rows = self.problem.view_of == index
@@ -301,25 +354,61 @@ class Fit:
             views=tuple(views),
             outliers=tuple(outliers),
             dropped=dropped,
-            poses={self.problem.views[i].name: (p.R_ct, p.t_ct_m) for i, p in self.state.free.items()},
+            poses={self.problem.views[i].name: pose for i, pose in self.free_poses().items()},
             iterations=self.iterations,
             sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
+            mistakes=self._mistakes(inverse),
+            priors=self.priors,
             solved=self,
         )
 
+    def _mistakes(self, covariance: FloatArray) -> tuple[Mistake, ...]:
+        """What became of each mistake that was an unknown; ``covariance`` of the shared unknowns."""
+        problem, state, geometry = self.problem, self.state, self.problem.geometry
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        found: list[Mistake] = []
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of the normal matrix (P, P), its columns first scaled to like size: pixels stand beside millimetres."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    return np.asarray(np.linalg.pinv(matrix * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
+        def add(
+            first: int, names: Sequence[str], subject: str, unit: str, off: FloatArray, prior: float, per: float = 1.0
+        ) -> None:
+            for i, name in enumerate(names):
+                spread = float(sigma[first + i]) * per
+                found.append(Mistake(name, subject, unit, float(off[i]) * per, spread, prior * per))
+
+        for index, prior in enumerate(geometry.pivot_sigmas_m):
+            off = state.pivots[index] - geometry.pivots_m[index]
+            add(problem.first_pivot + 3 * index, _PLACE, "pivot", "mm", off, float(prior), 1000.0)
+        for index, prior in enumerate(geometry.place_sigmas_m):
+            off = state.places[index] - geometry.places_m[index]
+            add(problem.first_place + 3 * index, _PLACE, geometry.place_names[index], "mm", off, float(prior), 1000.0)
+        for index, prior in enumerate(geometry.turn_sigmas_rad):
+            off = rotation_log(geometry.turns[index].T @ state.turns[index])
+            first, name = problem.first_turn + 3 * index, geometry.turn_names[index]
+            add(first, _TURN, name, "deg", off, float(prior), math.degrees(1.0))
+        extras = problem.extras
+        for index, name in enumerate(extras.names):
+            subject, unit, prior = extras.subjects[index], extras.units[index], float(extras.sigmas[index])
+            add(problem.first_extra + index, [name], subject, unit, state.extras[index : index + 1], prior)
+        return tuple(found)
 
 
-def _to_lens_parameters(lens: Lens, covariance: FloatArray) -> FloatArray:
-    """Covariance of (log f, k1_hw, k2_hw, sx, sy) to that of (f, k1, k2, sx, sy)."""
+def _whitened(whiten: FloatArray, values: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """W values for ``values`` (N, 2) or (N, 2, K), zero where not used (whatever stands there)."""
+    w11, w21, w22 = (whiten[:, i].reshape(-1, *[1] * (values.ndim - 2)) for i in range(3))
+    out = np.empty_like(values)
+    out[:, 0] = w11 * values[:, 0]
+    out[:, 1] = w21 * values[:, 0] + w22 * values[:, 1]
+    if not used.all():
+        out[~used] = 0.0
+    return out
+
+
+def per_unknown(lens: Lens) -> FloatArray:
+    """d (f, k1, k2, sx, sy) / d (log f, k1_hw, k2_hw, sx, sy), (5, 5)."""
     h = lens.half_width
     T = np.zeros((5, 5))
     T[0, 0] = lens.f_px
     T[1, 0], T[1, 1] = 2 * lens.k1, 1 / h**2
     T[2, 0], T[2, 2] = 4 * lens.k2, 1 / h**4
     T[3, 3] = T[4, 4] = 1.0
-    return np.asarray(T @ covariance @ T.T)
+    return T

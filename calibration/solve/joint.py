@@ -20,13 +20,17 @@ from calibration.lens import Lens
 from calibration.solve.engine_check import EngineAgreement, EngineCheck
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, solve_level
+from calibration.solve.nodal import DEPTH_RATIO, distance_of, two_distances
 from calibration.solve.outcome import level_result
 from calibration.solve.problem import View
 from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at, expected_points
 from calibration.tables import LeftOut, LevelResult
 from calibration.types import Detection, FloatArray, Refusal, Role, Target, TargetKind
 
-_PLACES: tuple[tuple[float, float, Role], ...] = (
+Place = tuple[float, float, Role]
+"""Where a target is to stand, as a share of the way from the picture's middle to its border, and what for."""
+
+_PLACES: tuple[Place, ...] = (
     (1.0, 1.0, Role.K2),
     (-1.0, -1.0, Role.K2),
     (1.0, -1.0, Role.K2),
@@ -36,6 +40,15 @@ _PLACES: tuple[tuple[float, float, Role], ...] = (
     (0.0, -1.0, Role.FREE),
     (0.0, 1.0, Role.FREE),
 )
+_NODAL_PLACES: tuple[Place, ...] = (
+    (1.0, 0.5, Role.NODAL),
+    (-1.0, -0.5, Role.NODAL),
+    (1.0, -0.5, Role.NODAL),
+    (-1.0, 0.5, Role.NODAL),
+)
+# Far out on both sides: there the size of a target and the swing of the pupil tell most.
+_SMALLEST_SHARE = 0.08
+# A target lower than this share of the picture's height tells too little of its size.
 # Opposite corners first: they tell the bend and the centre apart with the fewest pictures.
 _FIRST_PLACE = (0.75, 0.75, Role.FOV)
 # Before the distortion is known, a target sent to the very corner may be bent out of the picture.
@@ -50,14 +63,17 @@ _FIRST_GUESS_FOV_DEG = 40.0
 @dataclass(frozen=True, slots=True)
 class JointOptions:
     """``goal_px``: stop taking pictures when the largest expected overlay error is below it. ``min_views`` and
-    ``max_views`` bound the real pictures of a level, ``verify_views`` the engine's renders. ``margin``: distance kept
-    from the picture's border, as a share of its width. ``fill``: largest share of the picture's height that a target
-    chosen for a level may take."""
+    ``max_views`` bound the real pictures of a level, ``verify_views`` the engine's renders. ``nodal_goal_mm``: where a
+    second target stands at another distance, it is looked at until the nodal offset is this certain. ``margin``:
+    distance kept from the picture's border, as a share of its width. ``fill``: largest share of the picture's height
+    that a target chosen for a level may take.
+    """
 
     goal_px: float = 0.03
     min_views: int = 4
     max_views: int = 12
     verify_views: int = 1
+    nodal_goal_mm: float = 0.1
     margin: float = 0.02
     fill: float = 0.55
 
@@ -90,8 +106,10 @@ class JointMethod:
         self._problem = ""
         self._probes = self._probe_order()
         self._target = ""
-        self._places: list[tuple[float, float, Role]] = []
-        self._again: dict[int, tuple[float, float, Role]] = {}
+        self._places: list[Place] = []
+        self._second = ""
+        self._nodal_planned = False
+        self._again: dict[int, Place] = {}
         self._check: EngineCheck | None = None
 
     @property
@@ -220,29 +238,69 @@ class JointMethod:
     # --- collecting: the target where it tells most ---
 
     def _ask_place(self) -> Capture | None:
+        if self._nodal_known():
+            self._places = [place for place in self._places if place[2] is not Role.NODAL]
         if not self._places or self._enough():
-            if not self._pending:
+            if self._pending:
+                return None
+            if not self._plan_nodal():
                 self._begin_checks()
-                return self.ask()
-            return None
+            return self.ask()
+        if len(self._views) >= self._options.min_views:
+            # More pictures at one distance would not tell what a second one tells at once.
+            self._plan_nodal()
         place = self._places.pop(0)
+        name = self._target_at(place)
         pan, tilt = self._angles_for(place)
-        capture = self._capture(Source.REAL, self._target, pan, tilt, place[2])
+        capture = self._capture(Source.REAL, name, pan, tilt, place[2])
         self._again[capture.step] = place
         return capture
 
+    def _target_at(self, place: Place) -> str:
+        return self._second if place[2] is Role.NODAL else self._target
+
     def _enough(self) -> bool:
         """Pending pictures count as taken, so that one running ahead is not one too many."""
+        if any(place[2] is Role.NODAL for place in self._places):
+            return False
+        nodal = sum(view.target_name == self._second for view in self._views)
         count = len(self._views) + len(self._pending)
-        if count >= self._options.max_views:
+        if count - nodal >= self._options.max_views:
             return True
         if count < self._options.min_views or self._fit is None or self._straight:
             return False
         return predicted_overlay(self._fit.lens, self._fit.covariance).max_px <= self._options.goal_px
 
-    def _angles_for(self, place: tuple[float, float, Role]) -> tuple[float, float]:
+    def _nodal_known(self) -> bool:
+        seen = None if self._fit is None else self._fit.nodal_seen_mm
+        return seen is not None and two_distances(self._views) and seen[1] <= self._options.nodal_goal_mm
+
+    def _plan_nodal(self) -> bool:
+        """Whether pictures of a second target, at another distance, are to be taken for the nodal offset; plans them.
+
+        The target is that of which most is to be expected: large in the picture, far from the first in 1 / distance.
+        """
+        if self._nodal_planned or self._fit is None or self._straight or len(self._views) < 2:
+            return False
+        self._nodal_planned = True
+        lens, first = self._lens(), distance_of(self._task.targets[self._target], self._task.pivot_m)
+        worth: dict[str, float] = {}
+        for name in self._names:
+            target = self._task.targets[name]
+            distance = distance_of(target, self._task.pivot_m)
+            share = self._share(lens, target)
+            far_apart = max(distance, first) >= DEPTH_RATIO * min(distance, first)
+            if far_apart and _SMALLEST_SHARE <= share <= self._options.fill:
+                worth[name] = share * abs(1 / distance - 1 / first)
+        if not worth:
+            return False
+        self._second = max(worth, key=worth.__getitem__)
+        self._places = [*_NODAL_PLACES, *self._places]
+        return True
+
+    def _angles_for(self, place: Place) -> tuple[float, float]:
         """Head angles that put the target as far towards ``place`` as its outline stays inside the picture."""
-        lens, target = self._planning_lens(), self._task.targets[self._target]
+        lens, target = self._planning_lens(), self._task.targets[self._target_at(place)]
         width, height = lens.image_size
         margin = self._options.margin * width
         reach = np.array([(width - 1) / 2 - margin, (height - 1) / 2 - margin])
@@ -315,7 +373,8 @@ class JointMethod:
         if self._options.verify_views == 0:
             self._stage = _Stage.DONE
             return
-        # The last picture's pose first: the head stands there already.
+        # The last picture's pose first: the head stands there already. Targets of the nodal offset come last.
+        usable.sort(key=lambda view: view.target_name != self._second)
         self._check = EngineCheck(self._lens(), usable[::-1], self._task.engine, first_views=self._options.verify_views)
 
     def _ask_check(self) -> Capture | None:
@@ -391,6 +450,7 @@ class JointMethod:
             nodal_offset_mm=self._task.nodal_offset_mm,
             nodal_sigma_mm=self._task.nodal_sigma_mm,
             straight=straight,
+            priors=self._task.priors,
         )
 
     def _lens(self) -> Lens:

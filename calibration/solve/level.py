@@ -8,8 +8,8 @@ pictures contradict it, and what the pictures do not show is held at 0 and said 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from calibration.compare import predicted_overlay
 from calibration.errors import InvalidInput, NotConverged, NotEnoughData
 from calibration.lens import Lens
 from calibration.solve.iteration import Fit, LevelFit
+from calibration.solve.mistakes import Priors
+from calibration.solve.nodal import MEASURED_MM, parallax, two_distances
 from calibration.solve.problem import (
     LENS_COUNT,
     PRIOR_K1_HW,
@@ -50,21 +52,25 @@ def solve_level(
     nodal_sigma_mm: float = 0.0,
     guess: Lens | None = None,
     straight: bool = False,
+    priors: Priors | None = None,
 ) -> LevelFit:
     """Fit one lens to all pictures of a level. Raises :class:`calibration.errors.CalibrationError`.
 
-    ``nodal_offset_mm`` stands unless the pictures contradict it; with a ``nodal_sigma_mm`` it is only a prior, and what
-    the pictures and the prior leave open shows in the covariance. ``guess`` is a lens to start from; without one the
-    start is found from the pictures alone. ``straight`` holds k1 and k2 at 0: for the first pictures, which tell only
-    where to look next.
+    ``nodal_offset_mm`` stands unless the pictures contradict it, or show targets at two distances and tell it; with a
+    ``nodal_sigma_mm`` it is only a prior, and what the pictures and the prior leave open shows in the covariance.
+    ``guess`` is a lens to start from; without one the start is found from the pictures alone. ``straight`` holds k1 and
+    k2 at 0: for the first pictures, which tell only where to look next. ``priors``: how large mistakes of survey,
+    board, head and camera may be (:class:`calibration.solve.mistakes.Priors`).
     """
     if not views:
         raise NotEnoughData("no picture of this level shows its target")
     names = [v.name for v in views]
     if len(set(names)) != len(names):
         raise InvalidInput("picture names", names, "each view needs a name of its own")
+    bend = _BEND if straight else ()
+    known = _Known(image_size, pixel_aspect, nodal_offset_mm, nodal_sigma_mm, guess, bend, priors or Priors())
     try:
-        fit = _solve(views, image_size, pixel_aspect, nodal_offset_mm, nodal_sigma_mm, guess, _BEND if straight else ())
+        fit = _solve(views, known)
     except np.linalg.LinAlgError as error:
         raise NotConverged("the level's fit (its equations are singular)", 0, math.nan) from error
     fit.lens.require_unfolded()
@@ -78,21 +84,27 @@ def solve_level(
     return fit
 
 
-def _solve(
-    views: Sequence[View],
-    image_size: tuple[int, int],
-    pixel_aspect: float,
-    nodal_offset_mm: float,
-    nodal_sigma_mm: float,
-    guess: Lens | None,
-    bend: tuple[str, ...],
-) -> LevelFit:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What a fit is told besides its pictures; see :func:`solve_level`. ``bend``: lens quantities held at 0."""
+
+    image_size: tuple[int, int]
+    pixel_aspect: float
+    nodal_offset_mm: float
+    nodal_sigma_mm: float
+    guess: Lens | None
+    bend: tuple[str, ...]
+    priors: Priors
+
+
+def _solve(views: Sequence[View], known: _Known) -> LevelFit:
+    nodal_offset_mm, nodal_sigma_mm, bend, priors = (
+        known.nodal_offset_mm, known.nodal_sigma_mm, known.bend, known.priors,
+    )  # fmt: skip
     kept, dropped = list(views), []
     while True:
         _require_enough(kept)
-        lens, poses = start(kept, image_size, pixel_aspect, nodal_offset_mm, guess)
-        fitted = Fit(kept, lens, poses, held=bend, nodal_sigma_mm=nodal_sigma_mm or PRIOR_NODAL_MM)
-        fitted.run()
+        fitted = _first_fit(kept, known)
         bad = fitted.worst_view() if len(kept) > 2 else None
         if bad is None:
             bad = _odd_one_out(kept, fitted)
@@ -104,20 +116,50 @@ def _solve(
     seen = None if fit.sigma_nodal_mm is None else (fit.lens.nodal_offset_mm, fit.sigma_nodal_mm)
     nodal_told = False
     if seen is not None:
-        nodal_told = nodal_sigma_mm > 0 or abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
+        measured = two_distances(kept) and seen[1] <= MEASURED_MM
+        nodal_told = measured or nodal_sigma_mm > 0 or abs(seen[0] - nodal_offset_mm) > _NODAL_SIGNIFICANT * seen[1]
         if not nodal_told:
             # What contradicts nothing stays as given: left free, it would only take exactness from the field of view.
             given = replace(fit.lens, nodal_offset_mm=nodal_offset_mm)
-            fitted = Fit(kept, given, fitted.free_poses(), held=(*bend, "nodal_offset_mm"))
-            fitted.run()
+            held = Fit(kept, given, fitted.free_poses(), held=(*bend, "nodal_offset_mm"), priors=priors)
+            held.run(after=fitted)
+            fitted = held
             fit = fitted.result(tuple(dropped))
     untold = () if bend else _untold(fit)
     if untold:
-        held = untold if nodal_told else (*untold, "nodal_offset_mm")
-        again = Fit(kept, fit.lens, fitted.free_poses(), held=held)
-        again.run()
+        held_at = untold if nodal_told else (*untold, "nodal_offset_mm")
+        again = Fit(kept, fit.lens, fitted.free_poses(), held=held_at, priors=priors)
+        again.run(after=fitted)
         fit = replace(again.result(tuple(dropped)), covariance=fit.covariance, sigma_nodal_mm=fit.sigma_nodal_mm)
-    return replace(fit, untold=untold, nodal_told=nodal_told, nodal_seen_mm=seen)
+    check = parallax(fit.lens, nodal_offset_mm, seen[1], kept) if seen is not None and nodal_told else None
+    return replace(fit, untold=untold, nodal_told=nodal_told, nodal_seen_mm=seen, parallax=check)
+
+
+def _first_fit(kept: list[View], known: _Known) -> Fit:
+    """The fit from the quick start; with every pose free, from the thorough one too where the quick one led nowhere."""
+
+    def fitted_from(thorough: bool) -> Fit:
+        lens, poses = start(
+            kept, known.image_size, known.pixel_aspect, known.nodal_offset_mm, known.guess, thorough=thorough
+        )
+        nodal_sigma_mm = known.nodal_sigma_mm or PRIOR_NODAL_MM
+        fit = Fit(kept, lens, poses, held=known.bend, nodal_sigma_mm=nodal_sigma_mm, priors=known.priors)
+        fit.run()
+        return fit
+
+    if known.guess is not None or not all(view.free for view in kept):
+        return fitted_from(False)
+    try:
+        quick = fitted_from(False)
+    except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
+        return fitted_from(True)
+    if quick.floor_px <= MISFIT_PX and not quick.state.lens.folds_inside():
+        return quick
+    try:
+        thorough = fitted_from(True)
+    except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
+        return quick
+    return thorough if thorough.floor_px < quick.floor_px else quick
 
 
 def _odd_one_out(kept: list[View], fitted: Fit) -> tuple[int, str] | None:
@@ -159,17 +201,18 @@ def _untold(fit: LevelFit) -> tuple[str, ...]:
     return tuple(name for name, told in known.items() if not told)
 
 
-def residual_of(view: View, lens: Lens) -> FloatArray | None:
+def residual_of(view: View, lens: Lens, lifted: Mapping[str, FloatArray] | None = None) -> FloatArray | None:
     """Residuals (N, 2) px of a picture under a lens that was fitted without it; its own free pose is fitted first.
+    ``lifted``: how the boards stand out of their planes (:meth:`calibration.solve.geometry.Geometry.lifted`).
 
     None where the lens cannot explain the picture at all.
     """
     try:
         _, poses = start([view], lens.image_size, lens.pixel_aspect, lens.nodal_offset_mm, lens)
-        fitted = Fit([view], lens, poses, lens_free=False)
+        fitted = Fit([view], lens, poses, lens_free=False, lifted=lifted)
         if fitted.problem.count:
             fitted.iterate(robust=False)
-        residual = fitted.problem.evaluate(fitted.state, jacobian=False).residual_px
+        residual = fitted.problem.residuals(fitted.state)
     except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
         return None
     return residual if np.isfinite(residual).all() else None
@@ -185,12 +228,13 @@ def held_out_residuals(fit: LevelFit, views: Sequence[View]) -> dict[str, FloatA
         try:
             _require_enough(others)
             _, poses = start(others, fit.lens.image_size, fit.lens.pixel_aspect, fit.lens.nodal_offset_mm, fit.lens)
-            without = Fit(others, fit.lens, poses)
+            without = Fit(others, fit.lens, poses, priors=fit.priors)
             without.floor_px = fit.floor_px
             without.iterate(robust=False)
         except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
             continue
-        residual = residual_of(view, without.state.lens)
+        lifted = without.problem.geometry.lifted(without.state)
+        residual = residual_of(view, without.state.lens, lifted)
         if residual is not None:
             residuals[view.name] = residual
     return residuals

@@ -84,7 +84,8 @@ def level_result(
     elif not fit.nodal_told:
         reasons["nodal_offset_mm"] = (
             f"not told apart from {fit.lens.nodal_offset_mm:g} mm, which is taken: the pictures alone say "
-            f"{fit.nodal_seen_mm[0]:.1f} ± {fit.nodal_seen_mm[1]:.1f} mm"
+            f"{fit.nodal_seen_mm[0]:.1f} ± {fit.nodal_seen_mm[1]:.1f} mm; nodal offset and field of view look alike at "
+            "one distance: add a target at a clearly different one"
         )
     if held is None:
         reasons["held_out_px"] = "no picture could be spared from the fit"
@@ -116,6 +117,7 @@ def level_result(
         predicted_overlay_px=PixelError(expected.rms_px, expected.max_px),
         engine_overlay_px=engine_overlay_px,
         engine_values=_engine_values(fit.lens, engine),
+        parallax=fit.parallax,
         scenario=1 if edge_effect_px(fit.lens)[1] <= NEGLIGIBLE_PX else 2,
         left_out=every_left_out,
     )

@@ -1,26 +1,29 @@
-"""The least-squares problem of a level: which parameters there are, residuals, Jacobian, normal equations.
+"""The least-squares problem of a level: which unknowns there are, residuals, Jacobian, priors.
 
 Every picture of the level is one :class:`View`. One formulation serves posed targets, roughly posed ones and
-hand-held boards: a pose known exactly is a constant, one known roughly is a parameter with a prior, an unknown one
-a parameter without. Lens parameters of the iteration are (log f_px, k1_hw, k2_hw, sx, sy): of like size for every
-focal length.
+hand-held boards: a pose known exactly is a constant, one known roughly is an unknown with a prior, an unknown one
+an unknown without. Unknowns are of two kinds: SHARED by the pictures (the lens, the nodal offset, where pivot and
+targets stand, the mistakes of :mod:`calibration.solve.mistakes`) and each picture's OWN (how the camera was turned, or
+where a hand-held board was), so that the normal equations stay small (Schur complement, :mod:`.iteration`). Lens
+unknowns of the iteration are (log f_px, k1_hw, k2_hw, sx, sy): of like size for every focal length.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.camera import camera_rotation, target_rotation
 from calibration.lens import Lens
-from calibration.types import CameraPose, Detection, FloatArray, IntArray, Target
+from calibration.solve.geometry import Extras, Geometry
+from calibration.solve.mistakes import Priors
+from calibration.solve.rotation import rotation_exp, rotation_log, skew
+from calibration.types import CameraPose, Detection, FloatArray, Target
 
 LENS_COUNT = 5
-_PER_MM = np.array([[0.0], [0.0], [-0.001]])
-# d(points in camera axes, m) / d(nodal offset, mm): the pupil moves forward along the optical axis.
+OWN = 6
 PRIOR_K1_HW = 0.5
 PRIOR_K2_HW = 0.3
 PRIOR_SHIFT_OF_WIDTH = 0.1
@@ -28,6 +31,8 @@ PRIOR_NODAL_MM = 500.0
 _HELD = 1e-9
 # Wider than any lens that makes pictures (a 50 % bend at the edge, a pupil half a metre off the pivot); they only keep
 # a quantity finite that the pictures do not show, and such a quantity is then reported as not told.
+FreePoses = dict[int, tuple[FloatArray, FloatArray]]
+"""Camera from target (R, t in metres) by the number of the view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,90 +53,41 @@ class View:
         return self.camera_pose is None or self.target.pose is None
 
 
-def skew(v: FloatArray) -> FloatArray:
-    """[v]x (N, 3, 3) of v (N, 3), so that [v]x w = v x w."""
-    zero = np.zeros(v.shape[:-1])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack(
-        [np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)],
-        axis=-2,
-    )
-
-
-def rotation_exp(w: FloatArray) -> FloatArray:
-    """Rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
-    angle = float(np.linalg.norm(w))
-    k = skew(w)
-    if angle < 1e-9:
-        return np.asarray(np.eye(3) + k + k @ k / 2)
-    return np.asarray(np.eye(3) + math.sin(angle) / angle * k + (1 - math.cos(angle)) / angle**2 * (k @ k))
-
-
-def rotation_log(R: FloatArray) -> FloatArray:
-    """Rotation vector (3,) of a rotation matrix, radians; for angles well below pi."""
-    v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    sine = float(np.linalg.norm(v))
-    angle = math.atan2(sine, (float(np.trace(R)) - 1) / 2)
-    return np.asarray(v if sine < 1e-12 else v * angle / sine)
-
-
-@dataclass(slots=True, eq=False)
-class _Pivot:
-    start: int
-    prior_m: FloatArray
-    sigma_m: float
-    value_m: FloatArray
-
-
-@dataclass(slots=True, eq=False)
-class _Turn:
-    """A rotation with a prior. The increment is local: R <- R exp(w)."""
-
-    start: int
-    prior: FloatArray
-    sigma_rad: float
-    value: FloatArray
-
-
-@dataclass(slots=True, eq=False)
-class _Free:
-    """Camera from target, X_c = R q + t, without a prior. Increment R <- exp(w) R, t <- t + dt."""
-
-    start: int
-    R_ct: FloatArray
-    t_ct_m: FloatArray
-
-
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """All values of one iteration; copied before a trial step so that a bad step is simply dropped."""
+    """All values of one iteration. ``R``, ``t`` (V, 3, 3), (V, 3): camera from target of free pictures; the turn of
+    the camera beyond its nominal angles of the others (t unused). ``pivots``, ``places`` (·, 3) metres; ``turns``
+    (·, 3, 3) target to world; ``extras`` the mistakes."""
 
     lens: Lens
-    pivots: dict[tuple[float, ...], _Pivot] = field(default_factory=dict)
-    cameras: dict[int, _Turn] = field(default_factory=dict)
-    target_places: dict[str, _Pivot] = field(default_factory=dict)
-    target_turns: dict[str, _Turn] = field(default_factory=dict)
-    free: dict[int, _Free] = field(default_factory=dict)
-
-    def copy(self) -> State:
-        return State(
-            self.lens,
-            {k: _Pivot(p.start, p.prior_m, p.sigma_m, p.value_m) for k, p in self.pivots.items()},
-            {k: _Turn(p.start, p.prior, p.sigma_rad, p.value) for k, p in self.cameras.items()},
-            {k: _Pivot(p.start, p.prior_m, p.sigma_m, p.value_m) for k, p in self.target_places.items()},
-            {k: _Turn(p.start, p.prior, p.sigma_rad, p.value) for k, p in self.target_turns.items()},
-            {k: _Free(p.start, p.R_ct, p.t_ct_m) for k, p in self.free.items()},
-        )
+    R: FloatArray
+    t: FloatArray
+    pivots: FloatArray
+    places: FloatArray
+    turns: FloatArray
+    extras: FloatArray
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A change of all unknowns: ``shared`` (S,), ``own`` (V, 6)."""
+
+    shared: FloatArray
+    own: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Residuals (N, 2) in px (model minus picture) and the Jacobian (N, 2, P); rows with NaN cannot be projected."""
+    """Residuals (N, 2) px (model minus picture), their Jacobians ``shared`` (N, 2, S) and ``own`` (N, 2, 6), and the
+    priors' residuals over their sigmas with Jacobians; rows with NaN cannot be projected."""
 
     residual_px: FloatArray
-    jacobian: FloatArray
+    shared: FloatArray
+    own: FloatArray
     prior_residual: FloatArray
-    prior_jacobian: FloatArray
+    prior_shared: FloatArray
+    own_prior_residual: FloatArray  # (V, 3)
+    own_prior: FloatArray  # (V, 3, 3)
 
 
 class Problem:
@@ -140,200 +96,180 @@ class Problem:
     ``lens_free`` False keeps the lens as it is (only poses move); ``held`` names lens quantities (``k1``, ``k2``,
     ``center_shift_px``) to be kept at 0, or ``nodal_offset_mm`` to be kept as it is. The nodal offset, with the prior
     ``nodal_sigma_mm``, is an unknown wherever posed pictures could tell it: taken as known, its error would hide in
-    the field of view.
+    the field of view. ``lifted`` as :meth:`calibration.solve.geometry.Geometry.lifted`.
     """
 
     def __init__(
         self,
         views: Sequence[View],
         lens: Lens,
-        free_poses: dict[int, tuple[FloatArray, FloatArray]],
+        free_poses: FreePoses,
         *,
         lens_free: bool = True,
         held: tuple[str, ...] = (),
         nodal_sigma_mm: float = PRIOR_NODAL_MM,
+        priors: Priors | None = None,
+        lifted: Mapping[str, FloatArray] | None = None,
     ) -> None:
         self.views = tuple(views)
+        self.lens_free = lens_free
+        self.nodal_prior_mm = lens.nodal_offset_mm
         self._nodal_sigma_mm = nodal_sigma_mm
+        self.geometry = Geometry(self.views, priors or Priors(), shared_free=lens_free, lifted=lifted)
         shift_px = _HELD if "center_shift_px" in held else PRIOR_SHIFT_OF_WIDTH * lens.image_size[0]
-        self._prior_sigmas = (
+        self._lens_sigmas = (
             _HELD if "k1" in held else PRIOR_K1_HW,
             _HELD if "k2" in held else PRIOR_K2_HW,
             shift_px,
             shift_px,
         )
-        self.lens_free = lens_free
-        self.state = State(lens)
-        self.count = LENS_COUNT if lens_free else 0
-        self.nodal_prior_mm = lens.nodal_offset_mm
         posed = sum(not view.free for view in self.views)
         self.nodal_free = lens_free and posed >= 2 and "nodal_offset_mm" not in held
-        self.nodal_column = self._take(1) if self.nodal_free else -1
-        for index, view in enumerate(self.views):
-            self._add_unknowns(index, view, free_poses)
-        self.points_m: list[FloatArray] = []
+        geometry = self.geometry
+        self.lens_count = LENS_COUNT if lens_free else 0
+        self.nodal_column = self.lens_count if self.nodal_free else -1
+        self.first_pivot = self.lens_count + int(self.nodal_free)
+        self.first_place = self.first_pivot + 3 * len(geometry.pivots_m)
+        self.first_turn = self.first_place + 3 * len(geometry.places_m)
+        self.first_extra = self.first_turn + 3 * len(geometry.turns)
+        self.shared_count = self.first_extra + len(geometry.extras.names)
+        self.own_count = geometry.own_count
+        self.count = self.shared_count + int(self.own_count.sum())
+        self.view_of = geometry.view_of
         self.observed_px = np.concatenate([v.detection.points_px for v in self.views])
-        self.view_of: IntArray = np.concatenate(
-            [np.full(len(v.detection.points_px), i, dtype=np.int64) for i, v in enumerate(self.views)]
+        R, t = geometry.first_own(free_poses)
+        self.state = State(
+            lens, R, t, geometry.pivots_m, geometry.places_m, geometry.turns, np.zeros(len(geometry.extras.names))
         )
-        for view in self.views:
-            plane = view.target.points_m()[view.detection.point_ids]
-            self.points_m.append(np.column_stack([plane, np.zeros(len(plane))]))
 
-    def _take(self, size: int) -> int:
-        start = self.count
-        self.count += size
-        return start
+    @property
+    def extras(self) -> Extras:
+        """The mistakes that are unknowns here."""
+        return self.geometry.extras
 
-    def _add_unknowns(self, index: int, view: View, free_poses: dict[int, tuple[FloatArray, FloatArray]]) -> None:
-        camera, pose = view.camera_pose, view.target.pose
-        if camera is None or pose is None:
-            R_ct, t_ct_m = free_poses[index]
-            self.state.free[index] = _Free(self._take(6), R_ct, t_ct_m)
-            return
-        if camera.sigma_m > 0 and (*camera.pivot_m, camera.sigma_m) not in self.state.pivots:
-            prior = np.asarray(camera.pivot_m)
-            key = (*camera.pivot_m, camera.sigma_m)
-            self.state.pivots[key] = _Pivot(self._take(3), prior, camera.sigma_m, prior)
-        if camera.sigma_deg > 0:
-            R_wc = camera_rotation(camera.pan_deg, camera.tilt_deg, camera.roll_deg)
-            self.state.cameras[index] = _Turn(self._take(3), R_wc, math.radians(camera.sigma_deg), R_wc)
-        if pose.sigma_m > 0 and view.target_name not in self.state.target_places:
-            prior = np.asarray(pose.centre_m)
-            self.state.target_places[view.target_name] = _Pivot(self._take(3), prior, pose.sigma_m, prior)
-        if pose.sigma_deg > 0 and view.target_name not in self.state.target_turns:
-            R_wt = target_rotation(pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
-            self.state.target_turns[view.target_name] = _Turn(self._take(3), R_wt, math.radians(pose.sigma_deg), R_wt)
+    def residuals(self, state: State) -> FloatArray:
+        """Model minus picture (N, 2) px; NaN where a point cannot be drawn."""
+        points = self.geometry.camera_points(state)
+        z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
+        return np.asarray(state.lens.project(points[:, :2] / z[:, None]) - self.observed_px)
 
-    def camera_points(self, state: State, index: int) -> tuple[FloatArray, list[tuple[int, FloatArray]]]:
-        """One view's points in camera axes (n, 3), and d(points)/d(unknowns): (first column, (n, 3, columns)) each."""
-        view, q = self.views[index], self.points_m[index]
-        if index in state.free:
-            pose = state.free[index]
-            turned = q @ pose.R_ct.T
-            identity = np.broadcast_to(np.eye(3), (len(q), 3, 3))
-            return turned + pose.t_ct_m, [(pose.start, -skew(turned)), (pose.start + 3, identity)]
-        camera, target = view.camera_pose, view.target.pose
-        if camera is None or target is None:
-            raise RuntimeError("a view without a free pose has both poses")  # set up so in _add_unknowns
-        blocks: list[tuple[int, FloatArray]] = []
-        if self.nodal_free:
-            blocks.append((self.nodal_column, np.broadcast_to(_PER_MM, (len(q), 3, 1))))
-        turn = state.cameras.get(index)
-        R_wc = turn.value if turn else camera_rotation(camera.pan_deg, camera.tilt_deg, camera.roll_deg)
-        pivot = state.pivots.get((*camera.pivot_m, camera.sigma_m))
-        place = state.target_places.get(view.target_name)
-        target_turn = state.target_turns.get(view.target_name)
-        R_wt = target_turn.value if target_turn else target_rotation(target.yaw_deg, target.pitch_deg, target.roll_deg)
-        centre = place.value_m if place else np.asarray(target.centre_m)
-        stand = pivot.value_m if pivot else np.asarray(camera.pivot_m)
-        world = centre + q @ R_wt.T
-        turned = (world - stand) @ R_wc
-        if turn:
-            blocks.append((turn.start, skew(turned)))
-        if pivot:
-            blocks.append((pivot.start, np.broadcast_to(-R_wc.T, (len(q), 3, 3))))
-        if place:
-            blocks.append((place.start, np.broadcast_to(R_wc.T, (len(q), 3, 3))))
-        if target_turn:
-            blocks.append((target_turn.start, -np.asarray(R_wc.T @ R_wt @ skew(q))))
-        return turned - np.array([0.0, 0.0, state.lens.nodal_offset_mm / 1000.0]), blocks
-
-    def evaluate(self, state: State, *, jacobian: bool = True) -> Evaluation:
-        """Residuals and, if asked, derivatives at ``state``."""
+    def evaluate(self, state: State) -> Evaluation:
+        """Residuals and derivatives at ``state``."""
         lens = state.lens
-        total = len(self.observed_px)
-        J = np.zeros((total, 2, self.count if jacobian else 0))
-        rays = np.empty((total, 2))
-        first = 0
-        pose_parts: list[tuple[slice, int, FloatArray]] = []
-        depth: list[FloatArray] = []
-        for index in range(len(self.views)):
-            points, blocks = self.camera_points(state, index)
-            rows = slice(first, first + len(points))
-            first += len(points)
-            z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
-            rays[rows] = points[:, :2] / z[:, None]
-            if jacobian:
-                depth.append(z)
-                pose_parts += [(rows, start, block) for start, block in blocks]
-        residual = lens.project(rays) - self.observed_px
-        if jacobian:
-            self._fill(J, lens, rays, np.concatenate(depth), pose_parts)
-        prior_residual, prior_jacobian = self._priors(state)
-        return Evaluation(residual, J, prior_residual, prior_jacobian)
-
-    def _fill(
-        self,
-        J: FloatArray,
-        lens: Lens,
-        rays: FloatArray,
-        z: FloatArray,
-        pose_parts: list[tuple[slice, int, FloatArray]],
-    ) -> None:
+        posed = self.geometry.posed_points(state)
+        points = posed.points_m
+        z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
+        rays = points[:, :2] / z[:, None]
+        shared = np.zeros((len(points), 2, self.shared_count))
         if self.lens_free:
             per_lens = lens.jacobian_parameters(rays)
             h = lens.half_width
-            J[..., 0] = lens.f_px * per_lens[..., 0] + 2 * lens.k1 * per_lens[..., 1] + 4 * lens.k2 * per_lens[..., 2]
-            J[..., 1] = per_lens[..., 1] / h**2
-            J[..., 2] = per_lens[..., 2] / h**4
-            J[..., 3:5] = per_lens[..., 3:5]
-        if not pose_parts:
-            return
-        d_ray = np.zeros((len(rays), 2, 3))
-        d_ray[:, 0, 0] = d_ray[:, 1, 1] = 1 / z
-        d_ray[:, :, 2] = -rays / z[:, None]
-        per_point = lens.jacobian_rays(rays) @ d_ray
-        for rows, start, block in pose_parts:
-            J[rows, :, start : start + block.shape[-1]] += per_point[rows] @ block
-
-    def _priors(self, state: State) -> tuple[FloatArray, FloatArray]:
-        residual: list[float] = []
-        columns: list[tuple[int, float]] = []
-        if self.lens_free:
-            values = (state.lens.k1_hw, state.lens.k2_hw, *state.lens.center_shift_px)
-            for column, (value, sigma) in enumerate(zip(values, self._prior_sigmas, strict=True), start=1):
-                residual.append(value / sigma)
-                columns.append((column, 1 / sigma))
+            shared[..., 0] = (
+                lens.f_px * per_lens[..., 0] + 2 * lens.k1 * per_lens[..., 1] + 4 * lens.k2 * per_lens[..., 2]
+            )
+            shared[..., 1] = per_lens[..., 1] / h**2
+            shared[..., 2] = per_lens[..., 2] / h**4
+            shared[..., 3:5] = per_lens[..., 3:5]
+        by_ray = lens.jacobian_rays(rays)
+        per_point = np.empty((len(points), 2, 3))  # px per metre
+        per_point[..., :2] = by_ray / z[:, None, None]
+        per_point[..., 2] = -(per_point[..., 0] * rays[:, :1] + per_point[..., 1] * rays[:, 1:])
         if self.nodal_free:
-            residual.append((state.lens.nodal_offset_mm - self.nodal_prior_mm) / self._nodal_sigma_mm)
-            columns.append((self.nodal_column, 1 / self._nodal_sigma_mm))
-        for place in (*state.pivots.values(), *state.target_places.values()):
-            residual += list((place.value_m - place.prior_m) / place.sigma_m)
-            columns += [(place.start + i, 1 / place.sigma_m) for i in range(3)]
-        turns = (*state.cameras.values(), *state.target_turns.values())
-        jacobian = np.zeros((len(residual) + 3 * len(turns), self.count))
-        for row, (column, value) in enumerate(columns):
-            jacobian[row, column] = value
-        for turn in turns:
-            off = rotation_log(turn.prior.T @ turn.value)
-            rows = slice(len(residual), len(residual) + 3)
-            residual += list(off / turn.sigma_rad)
-            # d log(R exp(w)) / dw, the inverse right Jacobian to second order (the angles are small).
-            k = skew(off)
-            jacobian[rows, turn.start : turn.start + 3] = (np.eye(3) + k / 2 + k @ k / 12) / turn.sigma_rad
-        return np.asarray(residual), jacobian
+            shared[..., self.nodal_column] = np.where(self.geometry.posed[:, None], -0.001 * per_point[..., 2], 0.0)
+        self.geometry.fill_shared(
+            shared, per_point, state, posed, (self.first_pivot, self.first_place, self.first_turn, self.first_extra)
+        )
+        own = self.geometry.own_jacobian(per_point, posed)
+        residual, jacobian = self._shared_priors(state)
+        own_residual, own_prior = self._own_priors(state)
+        return Evaluation(
+            lens.project(rays) - self.observed_px, shared, own, residual, jacobian, own_residual, own_prior
+        )
+
+    def _shared_priors(self, state: State) -> tuple[FloatArray, FloatArray]:
+        geometry, lens = self.geometry, state.lens
+        residual: list[FloatArray] = []
+        columns: list[tuple[int, FloatArray]] = []
+        if self.lens_free:
+            sigmas = np.asarray(self._lens_sigmas)
+            residual.append(np.array([lens.k1_hw, lens.k2_hw, *lens.center_shift_px]) / sigmas)
+            columns.append((1, 1 / sigmas))
+        if self.nodal_free:
+            residual.append(np.array([(lens.nodal_offset_mm - self.nodal_prior_mm) / self._nodal_sigma_mm]))
+            columns.append((self.nodal_column, np.array([1 / self._nodal_sigma_mm])))
+        for first, values, priors, sigmas in (
+            (self.first_pivot, state.pivots, geometry.pivots_m, geometry.pivot_sigmas_m),
+            (self.first_place, state.places, geometry.places_m, geometry.place_sigmas_m),
+        ):
+            residual.append(((values - priors) / sigmas[:, None]).ravel())
+            columns.append((first, np.repeat(1 / sigmas, 3)))
+        extras = geometry.extras
+        residual.append(state.extras / extras.sigmas)
+        columns.append((self.first_extra, 1 / extras.sigmas))
+        straight = np.concatenate(residual)
+        jacobian = np.zeros((len(straight) + 3 * len(state.turns), self.shared_count))
+        row = 0
+        for first, factors in columns:
+            jacobian[np.arange(row, row + len(factors)), np.arange(first, first + len(factors))] = factors
+            row += len(factors)
+        turned = []
+        for index, (turn, prior, sigma) in enumerate(
+            zip(state.turns, geometry.turns, geometry.turn_sigmas_rad, strict=True)
+        ):
+            off = rotation_log(prior.T @ turn)
+            column = self.first_turn + 3 * index
+            jacobian[row : row + 3, column : column + 3] = _log_slope(off) / sigma
+            turned.append(off / sigma)
+            row += 3
+        return np.concatenate([straight, *turned]), jacobian
+
+    def _own_priors(self, state: State) -> tuple[FloatArray, FloatArray]:
+        residual, jacobian = np.zeros((len(self.views), 3)), np.zeros((len(self.views), 3, 3))
+        for index in np.flatnonzero(self.own_count == 3):
+            off = rotation_log(state.R[index])
+            inverse = self.geometry.inverse_turn_sigmas[index]
+            residual[index] = inverse @ off
+            jacobian[index] = inverse @ _log_slope(off)
+        return residual, jacobian
 
     @property
-    def weak_priors(self) -> int:
-        """How many priors say nothing a picture would not overrule: those of the lens itself."""
-        return (4 if self.lens_free else 0) + (1 if self.nodal_free else 0)
+    def prior_count(self) -> int:
+        """How many priors there are but those that say nothing a picture would not overrule: the lens's own."""
+        weak = (4 if self.lens_free else 0) + (1 if self.nodal_free else 0)
+        shared = self.shared_count - self.lens_count - int(self.nodal_free) + weak
+        return shared - weak + int(np.sum(self.own_count == 3)) * 3
 
-    def stepped(self, state: State, step: FloatArray) -> State:
-        """``state`` moved by ``step`` (P,)."""
-        new = state.copy()
+    def stepped(self, state: State, step: Step) -> State:
+        """``state`` moved by ``step``."""
+        lens, shared, own = state.lens, step.shared, step.own
         if self.lens_free:
-            lens = state.lens
-            f_px = lens.f_px * math.exp(float(np.clip(step[0], -0.7, 0.7)))
-            shift = (lens.center_shift_px[0] + float(step[3]), lens.center_shift_px[1] + float(step[4]))
-            nodal_mm = lens.nodal_offset_mm + (float(step[self.nodal_column]) if self.nodal_free else 0.0)
+            f_px = lens.f_px * math.exp(float(np.clip(shared[0], -0.7, 0.7)))
+            shift = (lens.center_shift_px[0] + float(shared[3]), lens.center_shift_px[1] + float(shared[4]))
+            nodal_mm = lens.nodal_offset_mm + (float(shared[self.nodal_column]) if self.nodal_free else 0.0)
             base = Lens(lens.image_size, f_px, 0.0, 0.0, shift, lens.pixel_aspect, nodal_mm)
-            new.lens = base.with_hw(f_px, lens.k1_hw + float(step[1]), lens.k2_hw + float(step[2]))
-        for place in (*new.pivots.values(), *new.target_places.values()):
-            place.value_m = place.value_m + step[place.start : place.start + 3]
-        for turn in (*new.cameras.values(), *new.target_turns.values()):
-            turn.value = turn.value @ rotation_exp(step[turn.start : turn.start + 3])
-        for pose in new.free.values():
-            pose.R_ct = rotation_exp(step[pose.start : pose.start + 3]) @ pose.R_ct
-            pose.t_ct_m = pose.t_ct_m + step[pose.start + 3 : pose.start + 6]
-        return new
+            lens = base.with_hw(f_px, state.lens.k1_hw + float(shared[1]), state.lens.k2_hw + float(shared[2]))
+        R, t = state.R.copy(), state.t.copy()
+        moved = rotation_exp(own[:, :3])
+        free, turned = self.own_count == 6, self.own_count == 3
+        # Free poses turn in the camera's frame, the camera itself in its own: the increments stay local.
+        R[free] = moved[free] @ R[free]
+        R[turned] = R[turned] @ moved[turned]
+        t[free] += own[free, 3:]
+        turns = state.turns
+        if len(turns):
+            turns = turns @ rotation_exp(shared[self.first_turn : self.first_extra].reshape(-1, 3))
+        return State(
+            lens,
+            R,
+            t,
+            state.pivots + shared[self.first_pivot : self.first_place].reshape(-1, 3),
+            state.places + shared[self.first_place : self.first_turn].reshape(-1, 3),
+            turns,
+            state.extras + shared[self.first_extra :],
+        )
+
+
+def _log_slope(off: FloatArray) -> FloatArray:
+    """d log(R exp(w)) / dw at log R = ``off``: the inverse right Jacobian to second order (the angles are small)."""
+    k = skew(off)
+    return np.asarray(np.eye(3) + k / 2 + k @ k / 12)

@@ -16,7 +16,7 @@ The caller (``app.jobs``) does the I/O between::
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
@@ -26,6 +26,7 @@ from calibration.camera import project_points, project_target, target_points_wor
 from calibration.errors import InvalidInput
 from calibration.lens import Lens
 from calibration.solve.engine_model import IDENTITY, EngineModel
+from calibration.solve.mistakes import Priors
 from calibration.tables import LevelResult
 from calibration.types import CameraPose, DetectionResult, FloatArray, Role, Target
 
@@ -73,10 +74,11 @@ class LevelTask:
     """What a method must know before it starts: one zoom and focus, the surveyed room, the picture.
 
     ``targets`` are posed, by name; ``pivot_m`` where the camera turns (``pivot_sigma_m``: its survey);
-    ``angle_sigma_deg`` the head's encoders; ``nodal_offset_mm`` stands unless the pictures contradict it, with a
-    ``nodal_sigma_mm`` it is a prior; ``guess`` the lens of a level that differs little (another focus), or None;
-    ``neighbour`` that of the level measured before, which only says what to look at first. ``pan_range_deg`` and
-    ``tilt_range_deg`` bound the head. ``engine``: how the engine draws, as learned.
+    ``angle_sigma_deg`` the head's encoders, ``roll_sigma_deg`` its roll; ``priors``: how large other mistakes may be;
+    ``nodal_offset_mm`` stands unless the pictures contradict it or tell it better, with a ``nodal_sigma_mm`` it is a
+    prior; ``guess`` the lens of a level that differs little (another focus), or None; ``neighbour`` that of the level
+    measured before, which only says what to look at first. ``pan_range_deg`` and ``tilt_range_deg`` bound the head.
+    ``engine``: how the engine draws, as learned.
     """
 
     zoom: float
@@ -87,6 +89,8 @@ class LevelTask:
     pixel_aspect: float = 1.0
     pivot_sigma_m: float = 0.0
     angle_sigma_deg: float = 0.0
+    roll_sigma_deg: float | None = None
+    priors: Priors = field(default_factory=Priors)
     nodal_offset_mm: float = 0.0
     nodal_sigma_mm: float = 0.0
     guess: Lens | None = None
@@ -104,7 +108,9 @@ class LevelTask:
 
     def pose(self, pan_deg: float, tilt_deg: float) -> CameraPose:
         """The camera's pose at these head angles, with the task's sigmas."""
-        return CameraPose(self.pivot_m, pan_deg, tilt_deg, 0.0, self.pivot_sigma_m, self.angle_sigma_deg)
+        return CameraPose(
+            self.pivot_m, pan_deg, tilt_deg, 0.0, self.pivot_sigma_m, self.angle_sigma_deg, self.roll_sigma_deg
+        )
 
 
 class LevelMethod(Protocol):

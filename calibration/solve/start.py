@@ -11,14 +11,14 @@ import numpy as np
 from calibration.camera import rays_of, target_points_world, world_to_camera
 from calibration.errors import NotEnoughData
 from calibration.lens import Lens
-from calibration.solve.problem import View
+from calibration.solve.problem import FreePoses, View
 from calibration.types import FloatArray
 
 _FOVS_DEG = (120.0, 95.0, 75.0, 60.0, 48.0, 38.0, 30.0, 22.0, 15.0, 9.0, 5.0, 3.0)
 _K1_HW = (-0.15, -0.05, 0.0, 0.05)
+_SHORTEST_F, _LONGEST_F = 0.2, 40.0
+# Focal lengths over the picture's width: fields of view of 136 and 1.4 degrees.
 # Coarse steps over all lenses that make pictures: the iteration converges from the nearest by far.
-
-FreePoses = dict[int, tuple[FloatArray, FloatArray]]
 
 
 def start(
@@ -27,11 +27,14 @@ def start(
     pixel_aspect: float,
     nodal_offset_mm: float,
     guess: Lens | None = None,
+    *,
+    thorough: bool = False,
 ) -> tuple[Lens, FreePoses]:
     """A lens and the free poses to start from.
 
-    With known poses every ray is known and u = f x + cx is linear in (f, cx, cy); otherwise the focal length and
-    the sign of the distortion are tried in coarse steps, each with the poses that fit it best.
+    With known poses every ray is known and u = f x + cx is linear in (f, cx, cy); otherwise the focal length
+    follows from the homographies, or, ``thorough``, it and the sign of the distortion are tried in coarse steps, each
+    with the poses that fit it best.
     """
     free = {i: v for i, v in enumerate(views) if v.free}
     if guess is not None:
@@ -39,6 +42,9 @@ def start(
     if len(free) < len(views):
         lens = _from_known_rays([v for v in views if not v.free], image_size, pixel_aspect, nodal_offset_mm)
         return lens, _poses(free, lens)[0]
+    quick = None if thorough else _from_homographies(views, image_size, pixel_aspect, nodal_offset_mm)
+    if quick is not None:
+        return quick, _poses(free, quick)[0]
     best: tuple[float, Lens, FreePoses] | None = None
     for fov in _FOVS_DEG:
         for k1_hw in _K1_HW:
@@ -50,6 +56,39 @@ def start(
     if best is None or not math.isfinite(best[0]):
         raise NotEnoughData("no pose explains any picture; check the target's size and its squares")
     return best[1], best[2]
+
+
+def _from_homographies(
+    views: Sequence[View], image_size: tuple[int, int], pixel_aspect: float, nodal_offset_mm: float
+) -> Lens | None:
+    """A focal length from the pictures alone, the principal point in the middle and no distortion; None if untold.
+
+    A plane's homography H = [h1 h2 h3] gives two equations linear in 1 / f^2 (Zhang, PAMI 22, 2000), with x, y counted
+    from the middle: h1'h2 = 0 and h1'h1 = h2'h2 in the metric diag(1/f^2, 1/f^2, 1). The weighted median of their
+    solutions is not led astray by the pictures in which the board faces the camera.
+    """
+    middle = (np.asarray(image_size, dtype=np.float64) - 1) / 2
+    squares: list[tuple[float, float]] = []
+    for view in views:
+        plane = view.target.points_m()[view.detection.point_ids]
+        if len(plane) < 4:
+            continue
+        pixels = (view.detection.points_px - middle) / [1.0, pixel_aspect] / image_size[0]
+        H, _ = cv2.findHomography(plane / max(view.target.outline_m()), pixels)
+        if H is None:
+            continue
+        (a, b), (c, d), (e, f) = (H[row, :2] for row in range(3))
+        for numerator, denominator in ((a * b + c * d, -e * f), (a * a + c * c - b * b - d * d, f * f - e * e)):
+            if numerator * denominator > 0:
+                squares.append((float(numerator / denominator), float(abs(denominator))))
+    if not squares:
+        return None
+    squares.sort()
+    weights = np.cumsum([weight for _, weight in squares])
+    f_px = math.sqrt(squares[int(np.searchsorted(weights, weights[-1] / 2))][0]) * image_size[0]
+    if not _SHORTEST_F < f_px / image_size[0] < _LONGEST_F:
+        return None
+    return Lens(image_size, f_px, pixel_aspect=pixel_aspect, nodal_offset_mm=nodal_offset_mm)
 
 
 def _from_known_rays(

@@ -36,6 +36,8 @@ class RoomKind(StrEnum):
     BOARDS = "boards"
     SQUARE = "square"
     LIGHT = "light"
+    DEPTH = "depth"
+    """Boards at two distances, as the nodal offset needs them; no two have as many squares."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Room:
 
 
 def build_room(kind: RoomKind = RoomKind.BOARDS) -> Room:
-    """The demo studio with its boards, or with plain red squares, or with boards and a phone's light.
+    """The demo studio with its boards; or with plain red squares, boards and a phone's light, boards at two distances.
 
     The boards' sizes stand to each other as a 20x zoom needs: there is always one that fills the picture well.
     """
@@ -157,6 +159,13 @@ def build_room(kind: RoomKind = RoomKind.BOARDS) -> Room:
             Panel("board_large", (9, 7), (0.1, 0.1), (_RED, _WHITE), large, margin_m=0.04),
             Panel("board_small", (8, 6), (0.03, 0.03), (_RED, _BLACK), small, margin_m=0.015),
             Panel("board_tiny", (7, 5), (0.008, 0.008), (_RED, _WHITE), tiny, margin_m=0.004),
+        )
+    if kind is RoomKind.DEPTH:
+        panels = (
+            *panels,
+            Panel("near_large", (10, 8), (0.04, 0.04), (_RED, _WHITE), (0.75, 2.2, 1.6), margin_m=0.02),
+            Panel("near_small", (9, 6), (0.012, 0.012), (_RED, _BLACK), (-0.8, 2.2, 1.6), margin_m=0.007),
+            Panel("near_tiny", (6, 5), (0.004, 0.004), (_RED, _WHITE), (-0.55, 2.2, 1.6), margin_m=0.002),
         )
     lamps = (Lamp("light", (0.0, 5.0, 1.6), 0.01),) if kind is RoomKind.LIGHT else ()
     return Room(kind, panels, lamps, tuple(_backdrop(panels)))

@@ -3,8 +3,8 @@
 RFC 4180 (commas, CRLF, doubled quotes), UTF-8, one header row with units in the names. What holds for the whole
 table (``lens`` to ``interpolation_...``) is repeated in every row, so that rows can be sorted, filtered and joined; on
 reading, all rows must agree on it. Columns may stand in any order and further columns are ignored. Numbers have all
-their digits; an empty cell is "not told". ``left_out``, ``reasons`` and ``engine_values`` hold
-JSON.
+their digits; an empty cell is "not told". ``left_out``, ``reasons``, ``engine_values`` and
+``parallax`` hold JSON.
 
 A text cell that a spreadsheet would take for a formula (it begins with = + - @, tab or carriage return) gets a
 leading apostrophe, which the reader takes away again.
@@ -79,8 +79,9 @@ _LEVEL_COLUMNS: dict[str, tuple[_Path, str]] = {
     "left_out": (("left_out",), _JSON),
     "reasons": (("reasons",), _JSON),
     "engine_values": (("engine_values",), _JSON),
+    "parallax": (("parallax",), _JSON),
 }
-_LATER_COLUMNS = ("engine_values",)
+_LATER_COLUMNS = ("engine_values", "parallax")
 """Columns that files of earlier versions do not have; without one, nothing of it is told."""
 
 

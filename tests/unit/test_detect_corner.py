@@ -6,15 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from calibration.detect.corner import (
-    PIXEL_VARIANCE_PX2,
-    CornerFit,
-    CornerState,
-    Signal,
-    cut_windows,
-    fit_corners,
-    guess_sigma,
-)
+from calibration.detect.corner import CornerFit, explained, fit_corners
+from calibration.detect.windows import PIXEL_VARIANCE_PX2, CornerState, Signal, strip_windows
 from calibration.types import FloatArray, Picture
 
 STEP_PX = 40
@@ -78,10 +71,15 @@ def fit(
         offset=np.full(count, 0.5),
         gain=np.full(count, 0.5),
     )
-    windows = cut_windows(signal, start, steps, 16)
-    sigma = guess_sigma(windows, start, STEP_PX / 2)
+    shares = {}
+    for sigma in (0.7, 1.4, 2.8, 5.6):
+        start = CornerState(start.points_px, start.angles, np.full(count, sigma), start.offset, start.gain)
+        windows = strip_windows(signal, start, steps, 16, 8.0)
+        shares[float(np.median(explained(windows, start)[0]))] = sigma
+    sigma = shares[max(shares)]
     start = CornerState(start.points_px, start.angles, np.full(count, sigma), start.offset, start.gain)
-    return fit_corners(signal, windows, start, np.full((count, 2), bend), iterations=15)
+    windows = strip_windows(signal, start, steps, 16, 3 * sigma + 2)
+    return fit_corners(windows, start, np.full((count, 2), bend), iterations=15)
 
 
 @pytest.mark.parametrize(("blur", "noise"), [(0.7, 2.0), (1.0, 2.0), (3.0, 2.0), (5.0, 2.0), (1.0, 8.0)])
@@ -130,12 +128,11 @@ def test_pixels_far_from_the_edges_are_not_needed() -> None:
     ones = np.ones(len(truth))
     start = CornerState(truth, angles, 1.05 * ones, 0.5 * ones, 0.5 * ones)
     steps = STEP_PX * np.stack([np.cos(angles), np.sin(angles)], axis=2)
-    every = cut_windows(signal, start, steps, 20)
-    band = cut_windows(signal, start, steps, 20, band_px=4.5)
+    every = strip_windows(signal, start, steps, 20, 20)
+    band = strip_windows(signal, start, steps, 20, 3.2)
     assert band.used.sum() < 0.6 * every.used.sum()
-    straight = np.zeros((len(truth), 2))
-    full = fit_corners(signal, every, start, straight, iterations=5)
-    thin = fit_corners(signal, band, start, straight, iterations=5)
+    full = fit_corners(every, start, None, iterations=5)
+    thin = fit_corners(band, start, None, iterations=5)
     ratio = thin.covariance_px2[:, 0, 0] / full.covariance_px2[:, 0, 0]
     assert ratio.max() < 1.05
 
@@ -146,6 +143,7 @@ def test_a_flat_window_is_reported_not_invented() -> None:
     one = np.ones(1)
     start = CornerState(np.array([[40.0, 40.0]]), np.array([[0.0, np.pi / 2]]), one, 0.5 * one, 0.5 * one)
     steps = np.array([[[40.0, 0.0], [0.0, 40.0]]])
-    result = fit_corners(signal, cut_windows(signal, start, steps, 12), start, np.zeros((1, 2)), iterations=10)
+    windows = strip_windows(signal, start, steps, 12, 4.0)
+    result = fit_corners(windows, start, None, iterations=10)
     sure = np.isfinite(result.covariance_px2).all() and np.sqrt(result.covariance_px2[0, 0, 0]) < 0.5
     assert not sure or abs(result.state.gain[0]) < 0.02

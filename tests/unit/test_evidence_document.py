@@ -12,6 +12,7 @@ import pytest
 from calibration.lens import Lens
 from calibration.solve.evidence import LevelInputs, level_evidence, solve_again
 from calibration.solve.level import held_out_residuals, solve_level
+from calibration.solve.mistakes import Priors
 from calibration.solve.outcome import level_result
 from calibration.solve.problem import View
 from calibration.synthetic import observe
@@ -33,15 +34,17 @@ def some_inputs() -> LevelInputs:
         pose = CameraPose((0.0, 0.0, 1.6), pan, tilt)
         seen = observe(LENS, pose, BOARD, rng, 0.02)
         assert isinstance(seen, Detection)
-        views.append(View(f"{pan},{tilt}", "board", BOARD, seen, replace(pose, sigma_deg=0.002)))
+        views.append(View(f"{pan},{tilt}", "board", BOARD, seen, replace(pose, sigma_deg=0.002, roll_sigma_deg=0.01)))
     hashes = {view.name: "ab" * 32 for view in views}
     left_out = (LeftOut("dark.png", "no target"),)
-    return LevelInputs(0.25, 0.5, SIZE, tuple(views), 1.0, 0.0, 0.0, left_out, hashes, {"numpy": "2"})
+    return LevelInputs(
+        0.25, 0.5, SIZE, tuple(views), 1.0, 0.0, 0.0, Priors(pan_scale=0.002), left_out, hashes, {"numpy": "2"}
+    )
 
 
 def test_a_level_is_solved_again_from_the_stored_document_alone() -> None:
     inputs = some_inputs()
-    fit = solve_level(inputs.views, SIZE)
+    fit = solve_level(inputs.views, SIZE, priors=inputs.priors)
     held_out = held_out_residuals(fit, inputs.views)
     result = level_result(fit, inputs.zoom, inputs.focus, held_out=held_out, left_out=inputs.left_out)
     document = evidence_to_document(level_evidence(fit, inputs, held_out))
@@ -58,7 +61,7 @@ def test_a_level_is_solved_again_from_the_stored_document_alone() -> None:
 
 def test_a_damaged_document_is_one_clear_error() -> None:
     inputs = some_inputs()
-    fit = solve_level(inputs.views, SIZE)
+    fit = solve_level(inputs.views, SIZE, priors=inputs.priors)
     document = evidence_to_document(level_evidence(fit, inputs, {}))
     document["inputs"]["pictures"][0]["points"][0][1] = "far"
     with pytest.raises(BadDocument, match=r"level evidence, inputs\.pictures\.0\.points\.0\.1"):

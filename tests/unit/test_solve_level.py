@@ -13,7 +13,8 @@ from calibration.errors import FoldedLens, InvalidInput, NotEnoughData
 from calibration.lens import Lens
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, residual_of, solve_level
-from calibration.solve.problem import Problem, View
+from calibration.solve.mistakes import Priors
+from calibration.solve.problem import Problem, State, Step, View
 from calibration.solve.start import start
 from calibration.synthetic import observe
 from calibration.types import CameraPose, Detection, Quality, Target, TargetKind, TargetPose
@@ -182,18 +183,36 @@ def test_the_problem_jacobian_agrees_with_a_numeric_one() -> None:
     views = [replace(v, target=target) for v in posed_views(WIDE, rng, camera=rough)[:3]]
     views += [replace(v, name="free" + v.name, camera_pose=None) for v in posed_views(WIDE, rng)[:2]]
     lens, poses = start(views, SIZE, 1.001, 30.0, WIDE)
-    problem = Problem(views, replace(lens, nodal_offset_mm=30.0, pixel_aspect=1.001), poses)
-    state = problem.stepped(problem.state, rng.normal(0, 1e-3, problem.count))
+    priors = Priors(0.002, 0.01, 0.01, 0.1, 0.1, 0.1, 5.0)
+    problem = Problem(views, replace(lens, nodal_offset_mm=30.0, pixel_aspect=1.001), poses, priors=priors)
+    assert len(problem.extras.names) == 17
+    own = (np.arange(6) < problem.own_count[:, None]).astype(float)
+    shared_count, size = problem.shared_count, 1e-6
+
+    def moved(state: State, column: int, by: float) -> State:
+        step = Step(np.zeros(shared_count), np.zeros_like(own))
+        if column < shared_count:
+            step.shared[column] = by
+        else:
+            step.own[:, column - shared_count] = by * own[:, column - shared_count]
+        return problem.stepped(state, step)
+
+    first = Step(rng.normal(0, 1e-3, shared_count), rng.normal(0, 1e-3, own.shape) * own)
+    state = problem.stepped(problem.state, first)
     analytic = problem.evaluate(state)
-    for column in range(problem.count):
-        step = np.zeros(problem.count)
-        step[column] = 1e-6
-        up = problem.evaluate(problem.stepped(state, step))
-        down = problem.evaluate(problem.stepped(state, -step))
-        numeric = (up.residual_px - down.residual_px) / 2e-6
-        np.testing.assert_allclose(analytic.jacobian[..., column], numeric, rtol=2e-5, atol=2e-3)
-        prior = (up.prior_residual - down.prior_residual) / 2e-6
-        np.testing.assert_allclose(analytic.prior_jacobian[:, column], prior, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(problem.residuals(state), analytic.residual_px, atol=1e-12)
+    for column in range(shared_count + 6):
+        up, down = (problem.evaluate(moved(state, column, by)) for by in (size, -size))
+        numeric = (up.residual_px - down.residual_px) / (2 * size)
+        mine = column - shared_count
+        jacobian = analytic.shared[..., column] if mine < 0 else analytic.own[..., mine]
+        np.testing.assert_allclose(jacobian, numeric, rtol=2e-5, atol=2e-3)
+        if mine < 0:
+            prior = (up.prior_residual - down.prior_residual) / (2 * size)
+            np.testing.assert_allclose(analytic.prior_shared[:, column], prior, rtol=1e-5, atol=1e-3)
+        elif mine < 3:
+            prior = (up.own_prior_residual - down.own_prior_residual) / (2 * size)
+            np.testing.assert_allclose(analytic.own_prior[..., mine], prior, rtol=1e-5, atol=1e-3)
 
 
 def test_bad_input_is_one_clear_error() -> None:
