@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,9 +11,11 @@ from datetime import datetime
 
 from app.documents import PictureModel, PictureSet
 from app.jobs.cpu import Cpu
+from app.jobs.evidence import versions
 from calibration.detect.target import find_target
 from calibration.errors import CalibrationError, InvalidInput, NotEnoughData
 from calibration.image import Transfer, decode_picture
+from calibration.solve.evidence import LevelEvidence, LevelInputs, level_evidence
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import held_out_residuals, solve_level
 from calibration.solve.outcome import level_result, shift_only_result
@@ -33,6 +36,7 @@ class SetLevel:
     result: LevelResult
     fit: LevelFit | None
     views: tuple[View, ...]
+    evidence: LevelEvidence | None = None
 
 
 def transfer_of(described: PictureSet, file: str) -> Transfer:
@@ -54,11 +58,12 @@ async def calibrate_set(
     for (zoom, focus), pictures in sorted(by_level.items()):
         started = time.monotonic()
         found: list[View | LeftOut] = []
-        for view in asyncio.as_completed([_look(described, picture, folder, cpu) for picture in pictures]):
+        hashes: dict[str, str] = {}
+        for view in asyncio.as_completed([_look(described, picture, folder, cpu, hashes) for picture in pictures]):
             found.append(await view)
             done += 1
             progress(0.95 * done / total, f"finding targets, {done} of {total} pictures")
-        level = await cpu.run(_solve, described, zoom, focus, pictures, found)
+        level = await cpu.run(_solve, described, zoom, focus, pictures, found, hashes)
         seconds = time.monotonic() - started
         levels.append(replace(level, result=replace(level.result, seconds=seconds)))
     progress(1.0, "done")
@@ -88,10 +93,13 @@ def _view_name(picture: PictureModel) -> str:
     return f"{picture.file} [{picture.target}]"
 
 
-async def _look(described: PictureSet, picture: PictureModel, folder: PictureFolder, cpu: Cpu) -> View | LeftOut:
+async def _look(
+    described: PictureSet, picture: PictureModel, folder: PictureFolder, cpu: Cpu, hashes: dict[str, str]
+) -> View | LeftOut:
     target = described.targets[picture.target].to_target()
     try:
         frame = await folder.read(picture.file)
+        hashes[_view_name(picture)] = await cpu.run(_sha256, frame.data)
         pixels = await cpu.run(decode_picture, frame.data, expected_size=described.image_size)
         found = await cpu.run(find_target, pixels, target, transfer=transfer_of(described, picture.file))
     except (AdapterError, InvalidInput) as error:
@@ -108,6 +116,7 @@ def _solve(
     focus: float,
     pictures: list[PictureModel],
     found: list[View | LeftOut],
+    hashes: dict[str, str],
 ) -> SetLevel:
     # Pictures finish in any order; the fit must not depend on it.
     place = {_view_name(picture): index for index, picture in enumerate(pictures)}
@@ -132,4 +141,20 @@ def _solve(
         if not views and left_out:
             reason += f"; {left_out[0].picture}: {left_out[0].reason}"
         return SetLevel(LevelResult.failed(zoom, focus, reason, left_out=tuple(left_out)), None, tuple(views))
-    return SetLevel(replace(result, frames=Frames(real=len(pictures))), fit, tuple(views))
+    inputs = LevelInputs(
+        zoom,
+        focus,
+        described.image_size,
+        tuple(views),
+        described.pixel_aspect,
+        priors=described.priors.to_priors(),
+        left_out=tuple(left_out),
+        picture_sha256={view.name: hashes[view.name] for view in views},
+        versions=versions(),
+    )
+    evidence = level_evidence(fit, inputs, held_out)
+    return SetLevel(replace(result, frames=Frames(real=len(pictures))), fit, tuple(views), evidence)
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from app import documents, events, main, settings
+from storage.evidence import evidence_schema_text
 
 
 def pages() -> dict[str, str]:
@@ -16,6 +17,7 @@ def pages() -> dict[str, str]:
     return {
         "events.schema.json": events.schema_text(),
         "job.schema.json": documents.schema_text(documents.JobRequest),
+        "level-evidence.schema.json": evidence_schema_text(),
         "openapi.json": main.openapi_text(),
         "picture-set.schema.json": documents.schema_text(documents.PictureSet),
         "settings.md": settings.reference_text(),

@@ -84,6 +84,16 @@ class Level(SQLModel, table=True):
     reason: str | None = Field(default=None, sa_type=Text)
 
 
+class Evidence(SQLModel, table=True):
+    """What a level's numbers rest on: its JSON document, compressed (zlib), and the hash of the text."""
+
+    __tablename__ = "evidence"
+
+    level_id: int = Field(primary_key=True, foreign_key="levels.id")
+    document: bytes
+    sha256: str = Field(sa_type=Text)
+
+
 class Event(SQLModel, table=True):
     """What happened to a job, numbered without gaps. Append-only: the database itself refuses a change."""
 

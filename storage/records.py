@@ -127,3 +127,11 @@ class PictureRecord:
 
     media_type: str
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceRecord:
+    """A level's evidence: its JSON document in UTF-8, and the hash of that, hexadecimal."""
+
+    document: bytes
+    sha256: str

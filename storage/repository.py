@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import uuid
+import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from datetime import datetime
@@ -29,6 +30,7 @@ from storage.records import (
     UNFINISHED_STATES,
     EventDraft,
     EventRecord,
+    EvidenceRecord,
     JobPage,
     JobRecord,
     JobState,
@@ -59,6 +61,9 @@ from storage.schemas import level_to_document
 
 MAX_PICTURE_BYTES = 32 * 1024 * 1024
 """A lossless 8K picture of noise stays below it."""
+
+MAX_EVIDENCE_BYTES = 32 * 1024 * 1024
+"""Packed; a level of 100 pictures with 1,000 points each stays below 8 MiB."""
 
 MAX_PAGE = 1000
 """Most rows that one call gives back; a larger limit counts as this one."""
@@ -215,16 +220,28 @@ class Repository:
     # Levels
 
     async def save_level(
-        self, job_id: str, ordinal: int, result: LevelResult, event: EventDraft, *, attempt: int = 1
+        self,
+        job_id: str,
+        ordinal: int,
+        result: LevelResult,
+        event: EventDraft,
+        *,
+        attempt: int = 1,
+        evidence: str | None = None,
     ) -> int:
-        """Commit a level and its event in one transaction; gives the event's seq.
+        """Commit a level, its event and its evidence (JSON text) in one transaction; gives the event's seq.
 
         ``ordinal`` is the level's place in the job's order, from 0; ``attempt`` counts from 1. Raises
-        :class:`StaleState` when the job is not running (or cancelling), :class:`AlreadyStored`, :class:`NotFound`.
+        :class:`StaleState` when the job is not running (or cancelling), :class:`AlreadyStored`, :class:`TooLarge`,
+        :class:`NotFound`.
         """
         now = self._now()
         zoom, focus = float(result.zoom), float(result.focus)
         document = to_json(level_to_document(result))
+        packed = None if evidence is None else zlib.compress(evidence.encode())
+        sha256 = hashlib.sha256((evidence or "").encode()).hexdigest()
+        if packed is not None and len(packed) > MAX_EVIDENCE_BYTES:
+            raise TooLarge("the level's evidence", len(packed), MAX_EVIDENCE_BYTES)
 
         def work(session: Session) -> int:
             job = find_job(session, job_id)
@@ -237,18 +254,20 @@ class Repository:
             )
             if session.exec(same).first() is not None:
                 raise AlreadyStored(job_id, zoom, focus, attempt)
-            session.add(
-                models.Level(
-                    job_id=job_id,
-                    ordinal=ordinal,
-                    zoom=zoom,
-                    focus=focus,
-                    attempt=attempt,
-                    status=result.status.value,
-                    result=document,
-                    reason=result.reason,
-                )
+            level = models.Level(
+                job_id=job_id,
+                ordinal=ordinal,
+                zoom=zoom,
+                focus=focus,
+                attempt=attempt,
+                status=result.status.value,
+                result=document,
+                reason=result.reason,
             )
+            session.add(level)
+            if packed is not None:
+                session.flush()
+                session.add(models.Evidence(level_id=stored(level.id), document=packed, sha256=sha256))
             job.updated = now
             return append_event(session, job, event, now)
 
@@ -276,6 +295,22 @@ class Repository:
             if level is None:
                 raise NotFound(f"committed level zoom {zoom:g}, focus {focus:g} in job", job_id)
             return level_record(level)
+
+        return await self._database.read(work)
+
+    async def get_evidence(self, job_id: str, zoom: float, focus: float) -> EvidenceRecord:
+        """The evidence of the last attempt of a level. Raises :class:`NotFound`."""
+
+        def work(session: Session) -> EvidenceRecord:
+            query = (
+                select(models.Evidence)
+                .join(models.Level, col(models.Level.id) == col(models.Evidence.level_id))
+                .where(models.Level.job_id == job_id, models.Level.zoom == zoom, models.Level.focus == focus)
+            )
+            row = session.exec(query.order_by(col(models.Level.attempt).desc())).first()
+            if row is None:
+                raise NotFound(f"evidence of level zoom {zoom:g}, focus {focus:g} in job", job_id)
+            return EvidenceRecord(zlib.decompress(row.document), row.sha256)
 
         return await self._database.read(work)
 

@@ -143,3 +143,18 @@ async def get_picture(
     picture = await context.repository.get_picture(job_id, level.ordinal, kind)
     media_type = picture.media_type if picture.media_type in SHOWN_MEDIA_TYPES else "application/octet-stream"
     return tagged(request, f'"{hashlib.sha256(picture.data).hexdigest()}"', picture.data, media_type)
+
+
+@router.get(
+    "/jobs/{job_id}/levels/{zoom}/{focus}/evidence",
+    response_class=Response,
+    responses={
+        200: {"content": {"application/json": {}}, "description": "docs/reference/level-evidence.schema.json"},
+        304: {"description": "the client has it already"},
+        **responses("not-found", "invalid"),
+    },
+)
+async def get_evidence(job_id: JobId, zoom: Encoder, focus: Encoder, context: Context, request: Request) -> Response:
+    """What a stored level's numbers rest on, and all that is needed to solve it again."""
+    evidence = await context.repository.get_evidence(job_id, zoom, focus)
+    return tagged(request, f'"{evidence.sha256}"', evidence.document, "application/json")

@@ -43,6 +43,7 @@ from calibration.lens import Lens
 from calibration.tables import LevelResult
 from engine_adapters.sim.launch import launched_studio
 from engine_adapters.sim.lens_truth import ZoomLens, embedded_lens_names, load_embedded
+from storage.evidence import EVIDENCE_FILE, evidence_file
 from storage.exports import EXPORTS
 from storage.schemas import table_to_document
 
@@ -92,10 +93,20 @@ def demo(
         for name in ("json", "csv"):
             export = EXPORTS[name]
             write_file(out / f"lens-table{export.suffix}", export.write(job.table))
+        write_file(out / EVIDENCE_FILE, evidence_file(job.evidence.values()))
         report = RunReport(
             title=f"{job.table.lens} on a simulated studio",
             table=job.table,
-            levels=[LevelReport(j.result, j.truth, j.error, job.pictures.get(_key(j.result), {})) for j in judged],
+            levels=[
+                LevelReport(
+                    j.result,
+                    j.truth,
+                    j.error,
+                    job.pictures.get(_key(j.result), {}),
+                    evidence=job.evidence.get(_key(j.result)),
+                )
+                for j in judged
+            ],
             facts=_facts(use, seconds),
             truth_at=partial(true_lens, truth),
         )

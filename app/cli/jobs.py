@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from app.bootstrap import Service, running_service
 from app.cli.console import Show, WorkFailed, warn
@@ -25,11 +27,12 @@ __all__ = ["FinishedJob", "Show", "run_job"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedJob:
-    """A job that left a table; ``pictures`` by level (zoom, focus) and kind."""
+    """A job that left a table; ``pictures`` by level (zoom, focus) and kind, ``evidence`` documents by level."""
 
     job_id: str
     table: LensTable
     pictures: dict[tuple[float, float], dict[PictureKind, bytes]]
+    evidence: dict[tuple[float, float], dict[str, Any]]
 
 
 async def run_job(settings: Settings, engines: Engines, request: JobRequest, show: Show) -> FinishedJob:
@@ -63,7 +66,7 @@ async def run_job(settings: Settings, engines: Engines, request: JobRequest, sho
         if summary is None:
             raise WorkFailed(f"job {record.id} is done but left no table; the store may have been changed meanwhile")
         table = (await service.repository.get_table(summary.id)).table
-        return FinishedJob(record.id, table, await _pictures(service, record.id))
+        return FinishedJob(record.id, table, await _pictures(service, record.id), await _evidence(service, record.id))
 
 
 def _measured(results: Sequence[LevelResult]) -> int:
@@ -101,6 +104,15 @@ async def _follow(service: Service, job_id: str, levels: int, show: Show) -> Non
                 if kind in TERMINAL_KINDS:
                     return
             await wakeups.wait(_LOOK_AGAIN_S)
+
+
+async def _evidence(service: Service, job_id: str) -> dict[tuple[float, float], dict[str, Any]]:
+    found: dict[tuple[float, float], dict[str, Any]] = {}
+    for level in await service.repository.list_levels(job_id):
+        zoom, focus = level.result.zoom, level.result.focus
+        with contextlib.suppress(NotFound):  # a level that failed has none
+            found[zoom, focus] = json.loads((await service.repository.get_evidence(job_id, zoom, focus)).document)
+    return found
 
 
 async def _pictures(service: Service, job_id: str) -> dict[tuple[float, float], dict[PictureKind, bytes]]:

@@ -6,7 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from app.jobs.cpu import Cpu
@@ -35,12 +35,13 @@ class SeenPicture:
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelOutcome:
     """What a level leaves: its result, its last render with the camera's picture at the same pose (or None), and
-    every target seen by the camera."""
+    every target seen by the camera. ``hashes``: SHA-256 of each picture file by the picture's name."""
 
     result: LevelResult
     real: SeenPicture | None
     virtual: SeenPicture | None
     seen: tuple[SeenPicture, ...]
+    hashes: Mapping[str, str] = field(default_factory=dict)
 
 
 class LevelRun:
@@ -58,6 +59,7 @@ class LevelRun:
         self._pending: dict[asyncio.Task[Observation], Taken] = {}
         self._real: dict[tuple[str, float, float], SeenPicture] = {}
         self._virtual: SeenPicture | None = None
+        self._hashes: dict[str, str] = {}
 
     async def run(self) -> LevelOutcome:
         """Run the level to its end.
@@ -85,7 +87,7 @@ class LevelRun:
             real = self._real.get((self._virtual.target, self._virtual.pan_deg, self._virtual.tilt_deg))
         elif self._real:
             real = list(self._real.values())[-1]
-        return LevelOutcome(result, real, self._virtual, tuple(self._real.values()))
+        return LevelOutcome(result, real, self._virtual, tuple(self._real.values()), self._hashes)
 
     async def _drive(self) -> None:
         while not self._method.done:
@@ -117,6 +119,7 @@ class LevelRun:
         for task in done:
             taken = self._pending.pop(task)
             observation = task.result()
+            self._hashes[observation.picture] = taken.sha256
             self._keep(taken, observation)
             await self._cpu.run(self._method.tell, observation)
             self._report_found(observation)

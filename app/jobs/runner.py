@@ -36,6 +36,7 @@ from app.events import (
 )
 from app.jobs.cpu import Cpu
 from app.jobs.engine import learn
+from app.jobs.evidence import evidence_or_none
 from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
 from app.jobs.state import sources
@@ -52,6 +53,7 @@ from calibration.types import TargetKind
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import LensValues, RenderEngine
 from storage.errors import StaleState, StorageError
+from storage.evidence import canonical_text, evidence_to_document
 from storage.records import JobRecord, JobState, PictureKind
 from storage.repository import Repository
 
@@ -111,6 +113,14 @@ def _pictures(
     if outcome.result.status is not LevelStatus.FAILED and isinstance(method, JointMethod) and method.fit is not None:
         expected = predicted_overlay(method.fit.lens, method.fit.covariance)
     return level_pictures(outcome, task, pixel_aspect, as_found=as_found, expected=expected)
+
+
+def _evidence(outcome: LevelOutcome, method: LevelMethod, task: LevelTask) -> str | None:
+    """The level's evidence as its document; None for a level without a fit, or of a method that has none."""
+    if not isinstance(method, JointMethod):
+        return None
+    evidence = evidence_or_none(method.fit, method.views, task, outcome.result, outcome.hashes)
+    return None if evidence is None else canonical_text(evidence_to_document(evidence))
 
 
 async def _lens_as_found(engine: RenderEngine) -> LensValues | None:
@@ -301,7 +311,8 @@ class JobRunner:
             outcome, problem = await self._level(job_id, ordinal, method, task, taker, lease)
             results.append(outcome.result)
             pictures = partial(_pictures, outcome, method, task, request.pixel_aspect, as_found)
-            await self._commit(job_id, ordinal, outcome.result)
+            evidence = await self._cpu.run(_evidence, outcome, method, task)
+            await self._commit(job_id, ordinal, outcome.result, evidence)
             # Drawn while the next level is measured; one level's pictures at a time are held in memory.
             await drawing.finish()
             drawing.begin(self._draw(job_id, ordinal, pictures))
@@ -367,14 +378,14 @@ class JobRunner:
             reason = f"internal error ({type(error).__name__}); the log has the details"
             return LevelOutcome(LevelResult.failed(task.zoom, task.focus, reason), None, None, ()), None
 
-    async def _commit(self, job_id: str, ordinal: int, result: LevelResult) -> None:
+    async def _commit(self, job_id: str, ordinal: int, result: LevelResult, evidence: str | None) -> None:
         event: AnyEvent
         if result.status is LevelStatus.FAILED:
             reason = result.reason or "unknown"
             event = LevelFailed(ordinal=ordinal, zoom=result.zoom, focus=result.focus, reason=reason)
         else:
             event = LevelDone.of(ordinal, result)
-        await self._repository.save_level(job_id, ordinal, result, draft(event))
+        await self._repository.save_level(job_id, ordinal, result, draft(event), evidence=evidence)
         self._broker.notify(job_id)
 
     async def _draw(self, job_id: str, ordinal: int, pictures: Callable[[], dict[PictureKind, bytes]]) -> None:

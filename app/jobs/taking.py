@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
@@ -39,12 +40,14 @@ _DELAY_BOUND_S = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Taken:
-    """A fresh picture and the pose that the head's encoders told. ``frozen``: it did not change though it had to."""
+    """A fresh picture and the pose that the head's encoders told. ``frozen``: it did not change though it had to.
+    ``sha256``: of the picture file's bytes as they came."""
 
     capture: Capture
     picture: Picture
     head: HeadState
     frozen: bool = False
+    sha256: str = ""
 
 
 @dataclass(slots=True)
@@ -78,6 +81,7 @@ class PictureTaker:
         self._shown: Shown | None = None
         self._last: NDArray[np.float32] | None = None
         self._must_change = False
+        self._sha256 = ""
 
     async def set_level(self, zoom: float, focus: float) -> None:
         """Drive the camera's lens to a level."""
@@ -170,7 +174,7 @@ class PictureTaker:
         self._last, self._must_change = seen, False
         if self._head is None:
             self._head = await self.read_head()
-        return Taken(capture, picture, self._head, frozen)
+        return Taken(capture, picture, self._head, frozen, self._sha256)
 
     async def _prepare(self, capture: Capture) -> None:
         try:
@@ -239,7 +243,10 @@ class PictureTaker:
 
     async def _fetch(self) -> Picture:
         async def goal() -> Picture:
-            return await self._decoded(await self._studio.frames.fetch())
+            frame = await self._studio.frames.fetch()
+            picture = await self._decoded(frame)
+            self._sha256 = await self._cpu.run(_sha256, frame.data)
+            return picture
 
         return await self._again(goal, classify_mockboard)
 
@@ -254,6 +261,10 @@ class PictureTaker:
             self.counters.real += 1
         else:
             self.counters.virtual += 1
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def lens_values(lens: Lens) -> LensValues:

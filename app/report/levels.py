@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from app.jobs.heatmap import heat_map, scale_end_px
 from app.jobs.pictures import jpeg
 from app.report.embed import Image, embedded
+from app.report.evidence import EvidenceView, evidence_view
 from app.report.figures import half_width_sigma
 from app.report.model import LevelReport
 from app.report.numbers import NONE, digits_for, encoder, number, pixels, sigma_text
@@ -119,6 +120,7 @@ class LevelView:
     cells: tuple[Cell, ...]
     pictures: tuple[tuple[str, str, str, str, str], ...]
     left_out: tuple[LeftOut, ...]
+    evidence: EvidenceView | None
 
 
 def lens_rows(level: LevelReport, table: LensTable, notes: Notes) -> list[Cell]:
@@ -217,6 +219,7 @@ def level_view(level: LevelReport, table: LensTable, opened: bool) -> LevelView:
         cells=tuple(lens_rows(level, table, Notes())),
         pictures=tuple(_used_pictures(level)),
         left_out=result.left_out,
+        evidence=evidence_view(level.evidence) if level.evidence is not None else None,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from calibration.compare import Overlay, predicted_overlay
 from calibration.lens import Lens
@@ -19,6 +20,7 @@ class LevelReport:
 
     ``truth`` and ``error`` (overlay error of the result against it) where the truth is known, as in a simulated
     studio. ``pictures``: encoded JPEG or PNG files. ``fit``: the fit itself where the caller has it.
+    ``evidence``: its evidence as a document (:mod:`storage.evidence`).
     """
 
     result: LevelResult
@@ -26,6 +28,7 @@ class LevelReport:
     error: Overlay | None = None
     pictures: Mapping[PictureKind, bytes] = field(default_factory=dict)
     fit: LevelFit | None = None
+    evidence: Mapping[str, Any] | None = None
 
     @property
     def key(self) -> tuple[float, float]:

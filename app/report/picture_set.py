@@ -9,6 +9,7 @@ from app.picture_sets import SetLevel
 from app.report.model import LevelReport, RunReport
 from calibration.solve.iteration import LevelFit
 from calibration.tables import LensTable
+from storage.evidence import evidence_to_document
 from storage.records import PictureKind
 
 
@@ -17,7 +18,13 @@ def picture_set_report(
 ) -> RunReport:
     """A report from what :func:`app.picture_sets.calibrate_set` gives; CPU work of a few ms a level (arrows)."""
     shown = [
-        LevelReport(level.result, pictures=_pictures(level.fit, table.image_size), fit=level.fit) for level in levels
+        LevelReport(
+            level.result,
+            pictures=_pictures(level.fit, table.image_size),
+            fit=level.fit,
+            evidence=None if level.evidence is None else evidence_to_document(level.evidence),
+        )
+        for level in levels
     ]
     return RunReport(title, table, shown, list(facts))
 

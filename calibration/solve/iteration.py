@@ -76,7 +76,7 @@ class LevelFit:
     None without such pictures; ``nodal_told``: it contradicts the one given, so that it stands in ``lens`` (else the
     given one does); ``sigma_nodal_mm`` is its sigma in the fit, None where held. ``parallax``: the operator's check,
     where it was told. ``mistakes``: what the pictures say of survey, board, head and camera where they were unknowns
-    with ``priors``.
+    with ``priors``. ``solved``: the iteration at its minimum, from which the level's evidence is taken.
     """
 
     lens: Lens
@@ -97,6 +97,7 @@ class LevelFit:
     nodal_told: bool = False
     nodal_seen_mm: tuple[float, float] | None = None
     parallax: Parallax | None = None
+    solved: Fit | None = None
 
     @property
     def sigma(self) -> FloatArray:
@@ -108,6 +109,15 @@ class LevelFit:
         """d fov_x / d f = -2 (W/2) / (f^2 + (W/2)^2), radians per px."""
         half = self.lens.image_size[0] / 2
         return math.degrees(2 * half / (self.lens.f_px**2 + half**2)) * float(self.sigma[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """A fit's residuals and Jacobians, its whitening (see :meth:`Fit._whitening`) and its normal equations."""
+
+    evaluation: Evaluation
+    whiten: FloatArray
+    normal: NormalEquations
 
 
 class Fit:
@@ -299,12 +309,17 @@ class Fit:
         distance = np.median(np.linalg.norm(residual[self.problem.view_of == worst[0]], axis=1))
         return worst[0], f"{worst[1]:.0%} of its points disagree with the other pictures (median {distance:.1f} px)"
 
+    def at_minimum(self) -> Minimum:
+        """Everything of the fit as it now stands."""
+        evaluation, whiten = self.problem.evaluate(self.state), self._whitening()
+        return Minimum(evaluation, whiten, self._normal(evaluation, whiten, robust=False))
+
     def result(self, dropped: tuple[tuple[str, str], ...]) -> LevelFit:
-        evaluation = self.problem.evaluate(self.state)
-        whiten = self._whitening()
-        lens = self.state.lens
-        inverse = self._normal(evaluation, whiten, False).shared_covariance()
-        covariance = _to_lens_parameters(lens, inverse[:LENS_COUNT, :LENS_COUNT])
+        at = self.at_minimum()
+        evaluation, whiten, lens = at.evaluation, at.whiten, self.state.lens
+        inverse = at.normal.shared_covariance()
+        T = per_unknown(lens)
+        covariance = T @ inverse[:LENS_COUNT, :LENS_COUNT] @ T.T
         column = self.problem.nodal_column
         residual = evaluation.residual_px
         whitened = _whitened(whiten, residual, self.used)
@@ -344,6 +359,7 @@ class Fit:
             sigma_nodal_mm=math.sqrt(max(inverse[column, column], 0.0)) if column >= 0 else None,
             mistakes=self._mistakes(inverse),
             priors=self.priors,
+            solved=self,
         )
 
     def _mistakes(self, covariance: FloatArray) -> tuple[Mistake, ...]:
@@ -387,12 +403,12 @@ def _whitened(whiten: FloatArray, values: FloatArray, used: NDArray[np.bool_]) -
     return out
 
 
-def _to_lens_parameters(lens: Lens, covariance: FloatArray) -> FloatArray:
-    """Covariance of (log f, k1_hw, k2_hw, sx, sy) to that of (f, k1, k2, sx, sy)."""
+def per_unknown(lens: Lens) -> FloatArray:
+    """d (f, k1, k2, sx, sy) / d (log f, k1_hw, k2_hw, sx, sy), (5, 5)."""
     h = lens.half_width
     T = np.zeros((5, 5))
     T[0, 0] = lens.f_px
     T[1, 0], T[1, 1] = 2 * lens.k1, 1 / h**2
     T[2, 0], T[2, 2] = 4 * lens.k2, 1 / h**4
     T[3, 3] = T[4, 4] = 1.0
-    return np.asarray(T @ covariance @ T.T)
+    return T

@@ -134,6 +134,8 @@ async def test_only_pictures_are_shown_as_pictures(client: httpx.AsyncClient, le
         ("0/0/picture?kind=virtual", "not-found"),
         ("0.5/0/picture", "not-found"),
         ("0/0/picture?kind=secret", "invalid"),
+        ("0/0/evidence", "not-found"),
+        ("2/0/evidence", "invalid"),
         ("nan/0/picture", "invalid"),
         ("1e999/0/picture", "invalid"),
         ("-0.1/0/picture", "invalid"),

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,8 +18,10 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlmodel import Session, SQLModel
 
+from calibration.tables import LevelResult
 from storage.database import MIGRATIONS, Database
-from storage.errors import DatabaseUnusable
+from storage.errors import DatabaseUnusable, NotFound
+from storage.records import JobState
 from storage.repository import Repository
 
 MOMENT = datetime(2026, 11, 21, 10, 0, 0, tzinfo=UTC)
@@ -27,8 +31,8 @@ NEXT = '''
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0002"
-down_revision = "0001"
+revision = "0003"
+down_revision = "0002"
 
 
 def upgrade():
@@ -50,7 +54,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 async def job_id(path: Path) -> str:
-    """A database of the first schema that holds one job."""
+    """A database of the newest schema that holds one job."""
     async with await Repository.open(path, now) as repository:
         return (await repository.create_job({"zooms": 7}, "XA 20x", "r3-a")).id
 
@@ -58,7 +62,7 @@ async def job_id(path: Path) -> str:
 def newer_migrations(folder: Path, end: str = "") -> Path:
     copy = folder / "migrations"
     shutil.copytree(MIGRATIONS, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "versions" / "r0002_next.py").write_text(NEXT.replace("{end}", end), encoding="utf-8")
+    (copy / "versions" / "r0003_next.py").write_text(NEXT.replace("{end}", end), encoding="utf-8")
     return copy
 
 
@@ -93,15 +97,15 @@ async def test_two_processes_may_make_the_database_at_once(path: Path) -> None:
     opened = await asyncio.gather(*(Repository.open(path, now) for _ in range(4)))
     for repository in opened:
         await repository.close()
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
 
 
 async def test_an_upgrade_keeps_the_rows_and_a_backup_of_before(path: Path, job_id: str, tmp_path: Path) -> None:
     database = await Database.open(path, now, newer_migrations(tmp_path))
     await database.close()
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0003",)]
     assert rows(path, "SELECT id, priority FROM jobs") == [(job_id, 5)]
-    assert backups(path) == ["lensmatch.backup-0001-20261121T100000Z.db"]
+    assert backups(path) == ["lensmatch.backup-0002-20261121T100000Z.db"]
     async with await Repository.open(path.with_name(backups(path)[0]), now) as repository:
         assert (await repository.get_job(job_id)).lens == "XA 20x"
 
@@ -134,17 +138,41 @@ async def test_a_killed_upgrade_leaves_the_old_database(
 
 
 async def test_no_backup_no_upgrade(path: Path, job_id: str, tmp_path: Path) -> None:
-    (tmp_path / "lensmatch.backup-0001-20261121T100000Z.db.unfinished").mkdir()
+    (tmp_path / "lensmatch.backup-0002-20261121T100000Z.db.unfinished").mkdir()
     migrations = newer_migrations(tmp_path)
     with pytest.raises(DatabaseUnusable, match="cannot be opened for writing"):
         await Database.open(path, now, migrations)
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
     assert rows(path, "SELECT id FROM jobs") == [(job_id,)]
 
 
 async def test_a_database_of_a_newer_version_is_left_alone(path: Path, job_id: str, tmp_path: Path) -> None:
     database = await Database.open(path, now, newer_migrations(tmp_path))
     await database.close()
-    with pytest.raises(DatabaseUnusable, match=r"newer version of Lensmatch \(schema 0002, .*; update Lensmatch"):
+    with pytest.raises(DatabaseUnusable, match=r"newer version of Lensmatch \(schema 0003, .*; update Lensmatch"):
         await Repository.open(path, now)
     assert rows(path, "SELECT id, priority FROM jobs") == [(job_id, 5)]
+
+
+def first_schema(folder: Path) -> Path:
+    copy = folder / "first"
+    shutil.copytree(MIGRATIONS, copy, ignore=shutil.ignore_patterns("__pycache__", "r0002*"))
+    return copy
+
+
+async def test_a_database_of_the_first_release_gets_a_place_for_evidence(path: Path, tmp_path: Path) -> None:
+    before = await Database.open(path, now, first_schema(tmp_path))
+    await before.close()
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
+    result = LevelResult.failed(0.0, 0.5, "dark")
+    async with await Repository.open(path, now) as repository:
+        job = await repository.create_job({"zooms": 7}, "XA 20x", "r3-a")
+        await repository.set_job_state(job.id, JobState.RUNNING, expected=[JobState.QUEUED])
+        await repository.save_level(job.id, 0, result, ("level_failed", {}), evidence='{"level_evidence":1}')
+        await repository.save_level(job.id, 1, replace(result, zoom=1.0), ("level_failed", {}))
+        found = await repository.get_evidence(job.id, 0.0, 0.5)
+        assert found.document == b'{"level_evidence":1}'
+        assert found.sha256 == hashlib.sha256(found.document).hexdigest()
+        with pytest.raises(NotFound, match="evidence of level zoom 1"):
+            await repository.get_evidence(job.id, 1.0, 0.5)
+    assert backups(path) == ["lensmatch.backup-0001-20261121T100000Z.db"]
