@@ -39,7 +39,21 @@ def show_table(table: LensTable) -> None:
     """Print the levels; reasons and pictures left out go to standard error, one line each."""
     grid = plain_table(
         f"{table.lens} on {table.camera}, {table.method}; each value with its sigma below; errors RMS, px",
-        ("zoom", "focus", "", "FoV x deg", "k1", "k2", "shift x", "y px", "residual", "held out", "expected", "pics"),
+        (
+            "zoom",
+            "focus",
+            "",
+            "FoV x deg",
+            "k1",
+            "k2",
+            "shift x",
+            "y px",
+            "nodal mm",
+            "residual",
+            "held out",
+            "expected",
+            "pics",
+        ),
     )
     for level in table.levels:
         _add_level(grid, level)
@@ -64,7 +78,7 @@ def _add_level(grid: Table, level: LevelResult) -> None:
     if level.frames.virtual:
         pictures = f"{level.frames.real}+{level.frames.virtual}"
     if level.status is LevelStatus.FAILED:
-        grid.add_row(*place, *[""] * 8, pictures if taken else "")
+        grid.add_row(*place, *[""] * 9, pictures if taken else "")
         return
     shift = level.center_shift_px or (None, None)
     grid.add_row(
@@ -74,6 +88,7 @@ def _add_level(grid: Table, level: LevelResult) -> None:
         _number(level.k2, 5),
         _number(shift[0], 3),
         _number(shift[1], 3),
+        _number(level.nodal_offset_mm, 2),
         _error(level.residual_px),
         _error(level.held_out_px),
         _error(level.predicted_overlay_px),
@@ -83,8 +98,8 @@ def _add_level(grid: Table, level: LevelResult) -> None:
     if sigma is None:
         return
     shift_sigma = sigma.center_shift_px or (None, None)
-    values = (sigma.fov_x_deg, sigma.k1, sigma.k2, *shift_sigma)
-    digits = (4, 5, 5, 3, 3)
+    values = (sigma.fov_x_deg, sigma.k1, sigma.k2, *shift_sigma, sigma.nodal_offset_mm)
+    digits = (4, 5, 5, 3, 3, 2)
     told = ["" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]
     grid.add_row("", "", "", *told, style="dim")
 
@@ -101,6 +116,12 @@ def _where(level: LevelResult) -> str:
 
 def _tell_reasons(level: LevelResult) -> None:
     _tell_reason(level)
+    if (seen := level.parallax) is not None:
+        messages.print(
+            f"[dim]{_where(level)}: over a pan of {seen.pan_deg:.1f} deg a thing at {seen.near_m:.1f} m moves "
+            f"{seen.as_given_px:.2f} px against one at {seen.far_m:.1f} m with the nodal offset as it was given, "
+            f"{seen.sigma_px:.3f} px (one sigma) with the one found[/]"
+        )
     for left in level.left_out:
         messages.print(f"[dim]{_where(level)}: left out {escape(left.picture)}: {escape(left.reason)}[/]")
 
