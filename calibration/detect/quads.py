@@ -25,7 +25,7 @@ _LEAST_FILL = 0.88
 _MOST_OF_ONE_COLOUR = 0.1
 """Largest difference of purity, as a share, within one paint under one lamp."""
 _GRID = 8
-_MOST_SAMPLES = 4000
+_MOST_SAMPLES = 1500
 _NEXT = np.array([1, 2, 3, 0])
 _BEFORE = np.array([3, 0, 1, 2])
 
@@ -264,7 +264,7 @@ def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32]) -> FloatArray
         return None
     along /= length[:, None]
     outward = np.column_stack([along[:, 1], -along[:, 0]])
-    points = contour[:: max(1, len(contour) // 400)].astype(np.float64)
+    points = contour[:: max(1, len(contour) // 200)].astype(np.float64)
     place = points @ along.T - np.sum(rough * along, axis=1)  # (N, 4): along each side
     off = points @ outward.T - np.sum(rough * outward, axis=1)
     near = ((np.abs(off) < np.maximum(2.0, 0.06 * length)) & (np.abs(place - length / 2) < 0.4 * length)).astype(float)
