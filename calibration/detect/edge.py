@@ -84,12 +84,12 @@ def fit_sides(
         fit = _straight(picture, curves, transfer, reach, margin, sigma)
     sigma = fit.sigma
     margin = min(1.5 * sigma + 0.5, 0.25 * min(lengths))
-    for most_lines, tolerance_px in ((60, 0.01), (_MOST_LINES, 5e-4)):
+    for most_lines, tolerance_px, least_steps in ((60, 0.01, 2), (_MOST_LINES, 5e-4, 3)):
         curves = meeting(fit.curves)
         reach = min(3.2 * fit.sigma * 1.2 + 2.0, room)
         most_lines = min(most_lines, max(_LEAST_LINES, int(_MOST_PIXELS / (2 * reach + 1))))
         fit = _Fit(picture, curves, transfer, reach, margin, fit.sigma, order=_MOST_TERMS - 1, most_lines=most_lines)
-        fit.run(10, tolerance_px)
+        fit.run(10, tolerance_px, least_steps=least_steps)
     return fit.sides()
 
 
@@ -98,7 +98,7 @@ def _straight(
 ) -> _Fit:
     """A first fit of straight sides on few lines of pixels."""
     fit = _Fit(picture, curves, transfer, reach_px, margin_px, sigma_px, order=1, most_lines=40)
-    fit.run(10, 0.05)
+    fit.run(10, 0.05, least_steps=2)
     return fit
 
 
@@ -226,11 +226,11 @@ class _Fit:
             share *= ndtr(self._inward(other) * away * cosine / self.sigma).reshape(y.shape)
         return share
 
-    def run(self, most_steps: int, tolerance_px: float) -> None:
-        """Iterate until the curves move by less than the tolerance, with weights that have settled."""
+    def run(self, most_steps: int, tolerance_px: float, *, least_steps: int) -> None:
+        """Iterate until the curves move by less than the tolerance; the weights follow the residuals of two steps."""
         for step in range(most_steps):
-            moved = self._step(reweigh=step in (0, 2))
-            if moved < tolerance_px and step >= 3:
+            moved = self._step(reweigh=step < 2)
+            if moved < tolerance_px and step >= least_steps - 1:
                 break
 
     def _step(self, *, reweigh: bool) -> float:

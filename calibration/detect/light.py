@@ -1,8 +1,7 @@
 """The light spot: a small, round, bright light, told from windows, desks and lamps by size, shape and surroundings.
 
-Found on the coded picture cut at falling levels; its centre is the centroid of the light above a level, clipped at
-the level where the picture saturates, averaged over several levels. A spot with a symmetric profile keeps its
-centroid through blur and saturation, because both treat all directions alike.
+Found on the coded picture cut at falling levels; its centre is then fitted to the pixels (``spot``). A round spot
+stays round through blur, glow and saturation, because all three treat all directions alike.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.detect.prediction import Prediction
+from calibration.detect.spot import fit_centre
 from calibration.errors import InvalidInput
-from calibration.image import Transfer, light_table, to_light
+from calibration.image import Transfer, light_table
 from calibration.types import (
     Detection,
     DetectionResult,
-    FloatArray,
     Picture,
     Quality,
     Refusal,
@@ -40,10 +39,8 @@ _LEAST_CONTRAST = 2.5
 # A light is among the brightest things that the camera sees.
 _LEAST_OF_BRIGHTEST = 0.4
 _CLEARLY_BETTER = 1.35
-_SHARES = (0.3, 0.4, 0.5, 0.6, 0.7)
-"""Levels of the centroid, between the surroundings (0) and the top (1)."""
-SYSTEMATIC_PX = 0.02
-"""Standard deviation of what is left of the symmetry of a real spot, per coordinate."""
+SYSTEMATIC_PX, SYSTEMATIC_OF_RADIUS = 0.004, 0.002
+"""Standard deviation of what is left of the symmetry of a real spot, per coordinate, beside what its residuals show."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,29 +193,21 @@ def _measured(part: Picture, spot: _Spot, transfer: Transfer, origin: tuple[int,
     """Centre and covariance of a spot in a part of the picture that begins at ``origin``."""
     height, width = part.shape[:2]
     reach = 2.2 * spot.radius + 3
-    left, top = math.floor(spot.centre[0] - reach - 2), math.floor(spot.centre[1] - reach - 2)
-    right, bottom = math.ceil(spot.centre[0] + reach + 3), math.ceil(spot.centre[1] + reach + 3)
+    left, top = math.floor(spot.centre[0] - reach - 1), math.floor(spot.centre[1] - reach - 1)
+    right, bottom = math.ceil(spot.centre[0] + reach + 2), math.ceil(spot.centre[1] + reach + 2)
     left, top, right, bottom = max(0, left), max(0, top), min(width, right), min(height, bottom)
-    light = to_light(part[top:bottom, left:right], transfer).astype(np.float64).mean(axis=2)
-    v, u = np.mgrid[top:bottom, left:right].astype(np.float64)
-    distance = np.hypot(u - spot.centre[0], v - spot.centre[1])
-    ring = distance > 2 * spot.radius + 2
-    low = float(np.median(light[ring])) if ring.any() else 0.0
-    inner = light[distance < max(1.0, 0.5 * spot.radius)]
-    high = float(np.quantile(inner, 0.75)) if inner.size else float(light.max())
-    centres, covariances = [], []
-    for share in _SHARES:
-        level = low + share * (high - low)
-        found = _centroid(light, u, v, spot.centre, level, high, reach)
-        if found is not None:
-            centres.append(found[0])
-            covariances.append(found[1])
-    if len(centres) < 3:
-        return Refusal("the light is cut by the picture's frame or runs into something as bright")
-    centre = np.mean(centres, axis=0)
-    # The levels see the same pixels: their scatter is not averaged out.
-    apart = np.array(centres) - centre
-    covariance = np.mean(covariances, axis=0) + apart.T @ apart / (len(centres) - 1) + np.eye(2) * SYSTEMATIC_PX**2
+    u, v = spot.centre
+    edge = 1.2 * spot.radius + 1
+    if min(u - left, v - top, right - 1 - u, bottom - 1 - v) < edge:
+        return Refusal("the light is cut by the picture's frame")
+    fit = fit_centre(
+        part[top:bottom, left:right], (u - left, v - top), radius_px=spot.radius, reach_px=reach, transfer=transfer
+    )
+    if fit is None:
+        return Refusal("the light has no centre that could be measured: it is not round, or runs into other light")
+    centre = fit.place + (left, top)
+    floor = SYSTEMATIC_PX + SYSTEMATIC_OF_RADIUS * spot.radius
+    covariance = fit.covariance + np.eye(2) * floor**2
     worst = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     if not math.isfinite(worst) or worst > 1.0:
         return Refusal(f"the light's centre is uncertain by {worst:.1f} px: too faint or too ragged")
@@ -235,44 +224,3 @@ def _measured(part: Picture, spot: _Spot, transfer: Transfer, origin: tuple[int,
             contrast=spot.contrast,
         ),
     )
-
-
-def _centroid(
-    light: FloatArray,
-    u: FloatArray,
-    v: FloatArray,
-    start: tuple[float, float],
-    level: float,
-    top: float,
-    reach: float,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Centroid (2,) and covariance (2, 2) of the light between a level and the top, in the region around a place.
-
-    Covariance: each pixel's deviation from the mean of its mirror images at the same radius, times its lever.
-    """
-    above = np.clip((light - level) / (top - level), 0.0, 1.0) if top > level else np.zeros_like(light)
-    count, labels = cv2.connectedComponents((above > 0).astype(np.uint8), connectivity=8)
-    inside = np.hypot(u - start[0], v - start[1]) < reach
-    if count < 2:
-        return None
-    weights = np.bincount(labels.ravel(), weights=(above * inside).ravel(), minlength=count)
-    weights[0] = 0.0
-    own = labels == int(np.argmax(weights))
-    if own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any():
-        return None
-    share = above * own
-    total = float(share.sum())
-    centre = np.array([float((share * u).sum()), float((share * v).sum())]) / total
-    du, dv = u - centre[0], v - centre[1]
-    radius = np.hypot(du, dv)
-    shell = np.minimum(np.rint(radius), math.ceil(reach * 2)).astype(int)
-    number = np.maximum(np.bincount(shell.ravel()), 1)
-    mean = np.bincount(shell.ravel(), weights=share.ravel()) / number
-    slope = np.gradient(mean)
-    # Within a shell the profile falls by itself: that part is no deviation.
-    deviation = share - mean[shell] - slope[shell] * (radius - shell)
-    square = deviation**2
-    covariance = np.array(
-        [[(square * du * du).sum(), (square * du * dv).sum()], [(square * du * dv).sum(), (square * dv * dv).sum()]]
-    )
-    return centre, covariance / total**2

@@ -22,8 +22,10 @@ LEAST_SIDE = 5.0
 # shape fits, and its corners are poorly determined.
 _LEAST_TILT_COS = 0.5
 _LEAST_FILL = 0.88
+_MOST_OF_ONE_COLOUR = 0.1
+"""Largest difference of purity, as a share, within one paint under one lamp."""
 _GRID = 8
-_MOST_SAMPLES = 4000
+_MOST_SAMPLES = 1500
 _NEXT = np.array([1, 2, 3, 0])
 _BEFORE = np.array([3, 0, 1, 2])
 
@@ -34,8 +36,8 @@ class Quad:
 
     ``fill`` overlap of the region with the quadrilateral (0..1), ``tilt_cos`` cosine of the tilt that its shape
     implies for the target's true proportions, ``side`` length of a square of the same area, ``unevenness`` deviation
-    of its light from a smooth gradient over its mean, ``strength`` and ``purity`` of its colour, ``cut`` whether
-    the frame cuts it.
+    of its light or its colour from a smooth gradient over the median, whichever is less, ``strength`` and ``purity`` of
+    its colour, ``cut`` whether the frame cuts it.
     """
 
     corners: FloatArray
@@ -94,7 +96,24 @@ def find_quads(
             if shape is not None:
                 _keep_best(shapes, shape)
     quads = [_with_colour(shape, field) for shape in shapes]
-    return sorted((quad for quad in quads if quad is not None), key=lambda quad: -quad.score)
+    ranked = sorted((quad for quad in quads if quad is not None), key=lambda quad: -quad.score)
+    return [quad for quad in ranked if not any(_is_lit_part(quad, other) for other in ranked)]
+
+
+def _is_lit_part(quad: Quad, whole: Quad) -> bool:
+    """Whether a candidate is the lit part of a target across which a shadow falls.
+
+    It lies in the whole, which has its colour throughout and is the better shape of the two.
+    """
+    if quad.side > 0.97 * whole.side or whole.cut or whole.unevenness > _MOST_OF_ONE_COLOUR:
+        return False
+    if abs(quad.purity - whole.purity) > _MOST_OF_ONE_COLOUR * whole.purity:
+        return False
+    if _shape_score(quad.fill, quad.tilt_cos) > _shape_score(whole.fill, whole.tilt_cos):
+        return False
+    outline = np.asarray(whole.corners, dtype=np.float32)
+    slack = 2.0 + 0.03 * whole.side
+    return all(cv2.pointPolygonTest(outline, (float(u), float(v)), True) > -slack for u, v in quad.corners)
 
 
 def clockwise_from_top_left(corners: FloatArray) -> FloatArray:
@@ -245,7 +264,7 @@ def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32]) -> FloatArray
         return None
     along /= length[:, None]
     outward = np.column_stack([along[:, 1], -along[:, 0]])
-    points = contour[:: max(1, len(contour) // 400)].astype(np.float64)
+    points = contour[:: max(1, len(contour) // 200)].astype(np.float64)
     place = points @ along.T - np.sum(rough * along, axis=1)  # (N, 4): along each side
     off = points @ outward.T - np.sum(rough * outward, axis=1)
     near = ((np.abs(off) < np.maximum(2.0, 0.06 * length)) & (np.abs(place - length / 2) < 0.4 * length)).astype(float)
@@ -271,7 +290,7 @@ def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32]) -> FloatArray
 
 
 def _inside(corners: FloatArray, field: ColourField) -> tuple[float, float, float]:
-    """Median strength and purity inside, and the unevenness: cell means against a plane, over the mean."""
+    """Median strength and purity inside, and the unevenness, of the light or of the colour, whichever is less."""
     height, width = field.strength.shape
     low = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
     high = np.minimum(np.ceil(corners.max(axis=0)), [width - 1, height - 1]).astype(int)
@@ -293,12 +312,21 @@ def _inside(corners: FloatArray, field: ColourField) -> tuple[float, float, floa
     cell_x = np.clip(((x[inner] / reach + 1) / 2 * grid).astype(int), 0, grid - 1)
     cell_y = np.clip(((y[inner] / reach + 1) / 2 * grid).astype(int), 0, grid - 1)
     cell = cell_y * grid + cell_x
+    pure = float(np.median(purity))
+    if strength <= 0:
+        return strength, pure, 0.0
+    # A shadow's edge changes the light but not the colour; a pattern or another thing changes both.
+    return strength, pure, min(_unevenness(values, cell, grid), _unevenness(purity, cell, grid))
+
+
+def _unevenness(values: Channel, cell: NDArray[np.int64], grid: int) -> float:
+    """Deviation of the cells' means from a plane, over the median."""
     number = np.bincount(cell, minlength=grid * grid)
     full = number > 0
+    if np.count_nonzero(full) < 4:
+        return 0.0
     mean = np.bincount(cell, weights=values, minlength=grid * grid)[full] / number[full]
-    if np.count_nonzero(full) < 4 or strength <= 0:
-        return strength, float(np.median(purity)), 0.0
     where = np.flatnonzero(full)
     plane = np.column_stack([np.ones(len(where)), where % grid, where // grid]).astype(np.float64)
     rest = mean - plane @ np.linalg.lstsq(plane, mean, rcond=None)[0]
-    return strength, float(np.median(purity)), float(np.sqrt(np.mean(rest**2))) / strength
+    return float(np.sqrt(np.mean(rest**2))) / max(float(np.median(values)), 1e-6)

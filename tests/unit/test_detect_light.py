@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from benchmarks.square_pictures import Spot, coded, spot_bound, spot_light
 from calibration.detect.light import find_light
 from calibration.detect.prediction import Prediction
 from calibration.errors import InvalidInput
@@ -86,6 +87,44 @@ def test_centre_and_its_covariance(kind: str, most_rms: float) -> None:
     assert np.sqrt(np.mean(np.square(errors))) < most_rms
     # Stated never much too small; it may be too large, as it carries what an uneven spot would do.
     assert np.mean(normalised) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("spot", "noise"),
+    [
+        (Spot(8, 5.0, 0.7), 2.0),
+        (Spot(2.5, 3.0, 0.7), 2.0),
+        (Spot(4, 0.6, 1.0), 2.0),
+        (Spot(5, 4.0, 0.7, glow=0.25, level=0.12, gradient=(1e-3, 5e-4)), 2.0),
+        (Spot(3, 2.0, 4.0), 2.0),
+        (Spot(6, 5.0, 1.0), 5.0),
+    ],
+    ids=["saturated disk", "saturated small", "unsaturated", "glow and gradient", "blurred", "noisy"],
+)
+def test_reaches_the_cramer_rao_bound(spot: Spot, noise: float) -> None:
+    over_bound, over_stated = [], []
+    for seed in range(8):
+        rng = np.random.default_rng([7, seed])
+        centre = 130 + rng.uniform(-3, 3, 2)
+        light = np.repeat(spot_light(spot, centre, 260)[..., None], 3, axis=2)
+        detection = found(find_light(coded(light, noise, rng), LIGHT))
+        error = detection.centre_px - centre
+        over_bound.append(error @ np.linalg.solve(spot_bound(spot, centre, 260, noise), error) / 2)
+        over_stated.append(error @ np.linalg.solve(detection.covariance_px2[0], error) / 2)
+    # 16 squares of errors at the bound: their mean is 1 with a sigma of 0.35.
+    assert math.sqrt(np.mean(over_bound)) < 1.5
+    assert np.mean(over_stated) < 1.6
+
+
+def test_spot_that_is_not_round_widens_the_covariance() -> None:
+    sigmas = []
+    for lobe in (0.0, 0.25):
+        room = Room()
+        room.disk(150.2, 110.4, 6, power=0.6, sigma=1.0)
+        room.gaussian(153, 107, 2.0, peak=lobe)
+        detection = found(find_light(room.picture(), LIGHT))
+        sigmas.append(math.sqrt(np.trace(detection.covariance_px2[0]) / 2))
+    assert sigmas[1] > 2 * sigmas[0]
 
 
 def test_shape_of_the_result() -> None:

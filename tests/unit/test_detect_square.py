@@ -189,6 +189,18 @@ def test_lamp_level_does_not_matter(exposure: float) -> None:
     assert np.abs(off(detection, corners)).max() < 0.15
 
 
+@pytest.mark.parametrize("lit", [0.35, 0.5, 0.7, 0.85])
+@pytest.mark.parametrize("left", [0.25, 0.5])
+def test_shadow_across_it(lit: float, left: float) -> None:
+    """The lit part has straight sides too, and more light than the whole."""
+    scene = Scene(480, 360)
+    corners = scene.fill(square_at(240, 180, 120, 3), RED)
+    edge = 240 + 120 * (0.5 - lit)
+    across = np.arange(480) - edge
+    scene.light *= (left + (1 - left) * ndtr(across / 1.5))[None, :, None]
+    assert np.abs(off(found(find_square(scene.picture(), SQUARE)), corners)).max() < 0.06
+
+
 def test_two_equal_squares_are_refused_unless_one_is_expected() -> None:
     scene = Scene(640, 360)
     one = scene.fill(square_at(160, 180, 110), RED)
