@@ -45,6 +45,13 @@ _BOW_POINTS = 12
 # A target with fewer points (a square has four) does not show its own bow.
 
 
+def target_points(views: Sequence[View]) -> FloatArray:
+    """Where the points of all pictures lie in their targets' planes, (N, 2) metres."""
+    planes = {id(view.target): view.target for view in views}  # pictures of a level share their targets
+    points = {key: target.points_m() for key, target in planes.items()}
+    return np.concatenate([points[id(view.target)][view.detection.point_ids] for view in views])
+
+
 def shape_m(target: Target, name: str, size_mm: float) -> FloatArray:
     """How far (m) a shape of ``size_mm`` lifts each of a target's points, (N,)."""
     points = target.points_m()
@@ -89,7 +96,7 @@ class Geometry:
         self._views = views
         counts = [len(v.detection.points_px) for v in views]
         self.view_of: IntArray = np.repeat(np.arange(len(views), dtype=np.int64), counts)
-        plane = np.concatenate([v.target.points_m()[v.detection.point_ids] for v in views])
+        plane = target_points(views)
         known = lifted or {}
         lift = [known[v.target_name][v.detection.point_ids] if v.target_name in known else np.zeros(n)
                 for v, n in zip(views, counts, strict=True)]  # fmt: skip
@@ -97,6 +104,7 @@ class Geometry:
         free = np.array([v.free for v in views])
         self.posed = ~free[self.view_of]
         self._free_view = free
+        self._no_turn = np.tile(np.eye(3), (len(views), 1, 1))
         poses = [v.camera_pose or CameraPose() for v in views]
         self._angles_deg = np.array([[p.pan_deg, p.tilt_deg, p.roll_deg] for p in poses])
         sigmas = np.array([[p.sigma_deg, p.sigma_deg, p.roll_sigma] for p in poses])
@@ -105,8 +113,9 @@ class Geometry:
         self.inverse_turn_sigmas = self._turn_sigmas(sigmas, turned)
         self._group_pivots(poses, free, shared_free)
         self._group_targets(free, shared_free)
+        self._any_posed, self._all_posed = bool((~free).any()), bool((~free).all())
         self.extras = self._extras(priors, free) if shared_free else Extras((), (), (), np.zeros(0))
-        self._lift = self._board_shapes()
+        self._lift_of, self._lift_m_per_mm = self._board_shapes()
 
     def _turn_sigmas(self, sigmas_deg: FloatArray, turned: FloatArray) -> FloatArray:
         """(V, 3, 3): rotation vector in camera axes over its sigmas. Tilt turns about the camera's x, pan about its y
@@ -185,25 +194,25 @@ class Geometry:
         names, subjects, units, sigmas = zip(*found, strict=True) if found else ((), (), (), ())
         return Extras(tuple(names), tuple(subjects), tuple(units), np.array(sigmas, dtype=np.float64))
 
-    def _board_shapes(self) -> dict[int, FloatArray]:
-        """For each shape of a board, how far (m for each mm) it lifts every point, (N,)."""
-        shapes: dict[int, FloatArray] = {}
-        for index, (name, subject) in enumerate(zip(self.extras.names, self.extras.subjects, strict=True)):
-            if name not in SHAPES:
-                continue
-            lift = np.zeros(len(self._q))
-            for number, view in enumerate(self._views):
-                if view.target_name == subject:
-                    shape = shape_m(view.target, name, 1.0)
-                    lift[self.view_of == number] = shape[view.detection.point_ids]
-            shapes[index] = lift
-        return shapes
+    def _board_shapes(self) -> tuple[list[int], FloatArray]:
+        """The mistakes that are shapes of boards, and how far (m for each mm) each lifts every point, (shapes, N)."""
+        which = [index for index, name in enumerate(self.extras.names) if name in SHAPES]
+        lift = np.zeros((len(which), len(self._q)))
+        rows: dict[str, tuple[Target, IntArray, IntArray]] = {}
+        for name in {self.extras.subjects[index] for index in which}:
+            seen = [number for number, view in enumerate(self._views) if view.target_name == name]
+            ids = np.concatenate([self._views[number].detection.point_ids for number in seen])
+            rows[name] = self._views[seen[0]].target, np.flatnonzero(np.isin(self.view_of, seen)), ids
+        for row, index in zip(lift, which, strict=True):
+            target, places, ids = rows[self.extras.subjects[index]]
+            row[places] = shape_m(target, self.extras.names[index], 1.0)[ids]
+        return which, lift
 
     def lifted(self, state: State) -> dict[str, FloatArray]:
         """By target, how far (m) each of its points stands out of its plane, as the state has it."""
         found: dict[str, FloatArray] = {}
         targets = {view.target_name: view.target for view in self._views}
-        for index in self._lift:
+        for index in self._lift_of:
             name, subject = self.extras.names[index], self.extras.subjects[index]
             shape = shape_m(targets[subject], name, float(state.extras[index]))
             found[subject] = found.get(subject, np.zeros(len(shape))) + shape
@@ -223,11 +232,9 @@ class Geometry:
     def posed_points(self, state: State) -> PosedPoints:
         """See the module."""
         of = self.view_of
-        q = self._q
-        if self._lift:
-            q = q.copy()
-            for index, lift in self._lift.items():
-                q[:, 2] += state.extras[index] * lift
+        q = self._q.T  # (3, N): each coordinate's numbers stand side by side, which numpy's loops want
+        if self._lift_of:
+            q = np.stack([q[0], q[1], q[2] + state.extras[self._lift_of] @ self._lift_m_per_mm])
         R_wt = self._R_wt
         if len(state.turns):
             R_wt = np.where((self._turn_of >= 0)[:, None, None], state.turns[self._turn_of], R_wt)
@@ -236,24 +243,29 @@ class Geometry:
             centre = np.where((self._place_of >= 0)[:, None], state.places[self._place_of], centre)
         if len(state.pivots):
             stand = np.where((self._pivot_of >= 0)[:, None], state.pivots[self._pivot_of], stand)
+        if not self._any_posed:
+            turned = _turned(state.R, of, q)
+            return PosedPoints((turned + state.t.T[:, of]).T, turned.T, turned.T, self._no_turn, state.R, self._no_turn)
         R_nominal, axes = self._nominal(state)
-        R_cw = np.where(self._free_view[:, None, None], np.eye(3), np.swapaxes(R_nominal @ state.R, 1, 2))
-        R_ct = np.where(self._free_view[:, None, None], state.R, R_cw @ R_wt)
-        turned = np.einsum("nij,nj->ni", R_ct[of], q)
-        from_pivot = turned
-        if self.posed.any():
-            # R_ct q + R_cw (centre - stand) is the same for posed pictures, and needs no second turn of all points.
-            off = np.einsum("vij,vj->vi", R_cw, centre - stand)
-            turned = np.where(self.posed[:, None], turned + off[of], turned)
-            if self.extras.names:
-                from_pivot = np.einsum("nji,nj->ni", R_cw[of], turned)
+        R_cw, R_ct, t = np.swapaxes(R_nominal @ state.R, 1, 2), state.R, state.t
         pupil = np.array([0.0, 0.0, state.lens.nodal_offset_mm / 1000.0])
         for way, column in (("right", 0), ("down", 1)):
             index = self._index(f"pupil off axis, {way}")
             if index >= 0:
                 pupil[column] = state.extras[index] / 1000.0
-        points = turned + np.where(self.posed[:, None], -pupil, state.t[of])
-        return PosedPoints(points, turned, from_pivot, R_cw, R_ct, axes)
+        # R_ct q + R_cw (centre - stand) is the same for posed pictures, and needs no second turn of all points.
+        off = np.einsum("vij,vj->vi", R_cw, centre - stand)
+        if self._all_posed:
+            R_ct, t = R_cw @ R_wt, np.broadcast_to(-pupil, state.t.shape)
+        else:
+            free = self._free_view
+            R_cw = np.where(free[:, None, None], np.eye(3), R_cw)
+            R_ct = np.where(free[:, None, None], state.R, R_cw @ R_wt)
+            off[free] = 0.0
+            t = np.where(free[:, None], state.t, -pupil)
+        turned = _turned(R_ct, of, q) + off.T[:, of]
+        from_pivot = _turned(np.swapaxes(R_cw, 1, 2), of, turned) if self.extras.names else turned
+        return PosedPoints((turned + t.T[:, of]).T, turned.T, from_pivot.T, R_cw, R_ct, axes)
 
     def _index(self, name: str) -> int:
         return self.extras.names.index(name) if name in self.extras.names else -1
@@ -304,15 +316,17 @@ class Geometry:
                 column = turn + 3 * number
                 q = self._q[rows]
                 shared[rows, :, column : column + 3] = cross(q[:, None, :], in_target[rows])
+        if self._lift_of:
+            out_of_plane = _along(per_point, posed.R_ct[:, :, 2].T[:, of])
+            for row, index in zip(self._lift_m_per_mm, self._lift_of, strict=True):
+                np.multiply(out_of_plane, row[:, None], out=shared[:, :, extra + index])
         for index, name in enumerate(self.extras.names):
-            moved = self._moved_by(index, name, posed)
-            shared[:, :, extra + index] = np.einsum("nij,nj->ni", per_point, moved)
+            if name not in SHAPES:
+                shared[:, :, extra + index] = _along(per_point, self._moved_by(name, posed).T)
 
-    def _moved_by(self, index: int, name: str, posed: PosedPoints) -> FloatArray:
-        """d(points in camera axes, m) / d(one mistake), (N, 3)."""
+    def _moved_by(self, name: str, posed: PosedPoints) -> FloatArray:
+        """d(points in camera axes, m) / d(one mistake of head or camera), (N, 3)."""
         of = self.view_of
-        if name in SHAPES:
-            return np.asarray(posed.R_ct[of][:, :, 2] * self._lift[index][:, None])
         if name.startswith("pupil"):
             moved = np.zeros_like(posed.points_m)
             moved[self.posed, 0 if name.endswith("right") else 1] = -0.001
@@ -326,13 +340,27 @@ class Geometry:
 
     def own_jacobian(self, per_point: FloatArray, posed: PosedPoints) -> FloatArray:
         """Derivatives (N, 2, 6) by each picture's own unknowns, zero where it has none."""
-        own = np.zeros((len(per_point), 2, 6))
+        own = np.zeros((6, 2, len(per_point))).transpose(2, 1, 0)
         if not self.own_count.any():
             return own
-        count = self.own_count[self.view_of][:, None, None]
+        count = self.own_count[self.view_of][:, None]
         # A free pose turns its points, a camera's turn moves them the other way; a pose known exactly does neither.
-        own[..., :3] = cross(posed.turned[:, None, :], per_point) * np.select(
-            [count == 6, count == 3], [1.0, -1.0], 0.0
-        )
-        own[..., 3:] = per_point * (count == 6)
+        sign = np.where(count == 6, 1.0, np.where(count == 3, -1.0, 0.0))
+        x, y, z = (sign * posed.turned[:, i : i + 1] for i in range(3))
+        px, py, pz = (per_point[..., i] for i in range(3))
+        own[..., 0], own[..., 1], own[..., 2] = y * pz - z * py, z * px - x * pz, x * py - y * px
+        own[..., 3:] = per_point if not self._any_posed else per_point * (count == 6)[..., None]
         return own
+
+
+def _turned(R: FloatArray, of: IntArray, points: FloatArray) -> FloatArray:
+    """R[of] p for points (3, N)."""
+    rows = R.reshape(len(R), 9).T[:, of]
+    x, y, z = points
+    return np.stack([rows[i] * x + rows[i + 1] * y + rows[i + 2] * z for i in (0, 3, 6)])
+
+
+def _along(per_point: FloatArray, moved: FloatArray) -> FloatArray:
+    """Derivatives (N, 2) px of points that move by ``moved`` (3, N)."""
+    x, y, z = (moved[i][:, None] for i in range(3))
+    return np.asarray(per_point[..., 0] * x + per_point[..., 1] * y + per_point[..., 2] * z)

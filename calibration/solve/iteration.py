@@ -28,6 +28,7 @@ from calibration.solve.problem import (
     FreePoses,
     Problem,
     State,
+    Step,
     View,
 )
 from calibration.solve.rotation import rotation_log
@@ -40,11 +41,17 @@ _CONVERGED_PX = 1e-7
 # A step that moves no point by more than this is the end: five orders below the best detector.
 _ROUGH_PX = 1e-3
 # The same between the rounds in which floor and outliers are still sought.
+_IDLE = 0.1
+# A step that is told to move no point by this share of what ends an iteration is not worth another evaluation.
+_FIRST_DAMPING, _LATER_DAMPING = 1e-4, 1e-8
+# Later rounds start beside their minimum: what holds a far start back would only take them several steps to get there.
 _OUTLIER_CHI2 = 25.0
 # Squared distance over its variance, 2 degrees of freedom: 5 sigma, one point in 270,000.
 _VIEW_OUTLIERS = 0.3
 # A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
 _FLOOR_ROUNDS = 6
+_BISECTIONS = 44
+# To below a millionth of a millionth of the residuals.
 _PLACE = ("place across", "place in depth", "height")
 _TURN = ("turn about its columns", "turn about its rows", "turn in its plane")
 
@@ -147,6 +154,7 @@ class Fit:
             lifted=lifted,
         )
         self.state: State = self.problem.state
+        self._at: tuple[State, Evaluation] | None = None
         self.detector_px2 = np.concatenate([v.detection.covariance_px2 for v in views])
         self.used = np.ones(len(self.detector_px2), dtype=bool)
         self.floor_px = 0.0
@@ -167,13 +175,13 @@ class Fit:
         """
         if after is None:
             self.floor_px = 1.0
-            self.iterate(robust=True)
+            self.iterate(robust=True, settled_px=_ROUGH_PX)
         else:
             self.floor_px, self.used = after.floor_px, after.used.copy()
             self.iterate(robust=False, settled_px=_ROUGH_PX)
         for _ in range(_FLOOR_ROUNDS):
             before = self.floor_px, self.used.copy()
-            residual = self.problem.residuals(self.state)
+            residual = self._evaluation().residual_px
             self.floor_px = self._robust_floor(residual)
             self._reject(residual)
             self.iterate(robust=False, settled_px=_ROUGH_PX)
@@ -184,9 +192,9 @@ class Fit:
 
     def iterate(self, *, robust: bool, settled_px: float = _CONVERGED_PX) -> None:
         """Gauss-Newton with Levenberg-Marquardt damping until no point moves; raises NotConverged."""
-        damping = 1e-4
+        damping = _FIRST_DAMPING if robust else _LATER_DAMPING
         whiten = self._whitening()
-        evaluation = self.problem.evaluate(self.state)
+        evaluation = self._evaluation()
         cost = self._cost(evaluation, whiten, robust)
         if not math.isfinite(cost):
             raise NotEnoughData("the start puts points where no lens draws; give a guess for the field of view")
@@ -199,6 +207,8 @@ class Fit:
                 if step is None:
                     damping = max(damping, 1e-6) * 10
                     continue
+                if damping < _FIRST_DAMPING and self._told(evaluation, step) < _IDLE * settled_px:
+                    return
                 trial = self.problem.stepped(self.state, step)
                 trial_evaluation = self.problem.evaluate(trial)
                 trial_cost = self._cost(trial_evaluation, whiten, robust)
@@ -211,11 +221,27 @@ class Fit:
             moved = float(np.nanmax(np.abs(difference[self.used])))
             gained = cost - trial_cost
             self.state, evaluation, cost = trial, trial_evaluation, trial_cost
+            self._at = trial, trial_evaluation
             damping = max(damping / 10, 1e-12)
             if moved < settled_px or (robust and gained < 1e-3 * (1 + cost)):
                 return
         if moved > 1e-3 and not robust:
             raise NotConverged("the level's fit", _ITERATIONS, moved)
+
+    def _evaluation(self) -> Evaluation:
+        """Residuals and derivatives where the fit stands."""
+        if self._at is None or self._at[0] is not self.state:
+            self._at = self.state, self.problem.evaluate(self.state)
+        return self._at[1]
+
+    def _told(self, evaluation: Evaluation, step: Step) -> float:
+        """How far (px) a step moves a point at most, to first order."""
+        moved = evaluation.shared @ step.shared
+        if self.problem.own_count.any():
+            by_point = step.own[self.problem.view_of]
+            for column in range(OWN):
+                moved += evaluation.own[..., column] * by_point[:, column, None]
+        return float(np.max(np.abs(moved[self.used]), initial=0.0))
 
     def _whitening(self) -> FloatArray:
         """(N, 3): w11, w21, w22 of lower triangles W with W^T W = inverse covariance of each point; zero for points
@@ -240,13 +266,10 @@ class Fit:
         return data + priors
 
     def _normal(self, evaluation: Evaluation, whiten: FloatArray, robust: bool) -> NormalEquations:
-        whitened = _whitened(whiten, evaluation.residual_px, self.used)
         if robust:
-            root = np.sqrt(self._robust_weights(whitened))
-            whitened, whiten = whitened * root[:, None], whiten * root[:, None]
-        shared = _whitened(whiten, evaluation.shared, self.used)
-        own = _whitened(whiten, evaluation.own, self.used) if self.problem.own_count.any() else None
-        return NormalEquations.of(self._rows, self.problem.own_count, evaluation, whitened, shared, own)
+            weights = self._robust_weights(_whitened(whiten, evaluation.residual_px, self.used))
+            whiten = whiten * np.sqrt(weights)[:, None]
+        return NormalEquations.of(self._rows, self.problem.own_count, evaluation, whiten, self.used)
 
     def _degrees_of_freedom(self) -> int:
         # Unknowns with a prior bring one observation each, so they take nothing from the points.
@@ -269,36 +292,30 @@ class Fit:
 
     def _floor_for_chi2(self) -> float:
         """The floor at which chi2 equals the degrees of freedom (0 if it is below them without one); bisection."""
-        residual = self.problem.residuals(self.state)[self.used]
+        residual = self._evaluation().residual_px[self.used]
         covariance = self.detector_px2[self.used]
         goal = self._degrees_of_freedom()
 
         def chi2(floor: float) -> float:
-            total = covariance + np.eye(2) * floor**2
-            solved = np.linalg.solve(total, residual[..., None])[..., 0]
-            return float(np.sum(residual * solved))
+            return float(np.sum(_distance2(residual, covariance, floor)))
 
         if chi2(0.0) <= goal:
             return 0.0
         low, high = 0.0, 10 * float(np.sqrt(np.mean(residual**2))) + 1e-9
-        for _ in range(60):
+        for _ in range(_BISECTIONS):
             middle = (low + high) / 2
             low, high = (middle, high) if chi2(middle) > goal else (low, middle)
         return high
 
-    def _distance2(self, residual: FloatArray) -> FloatArray:
-        covariance = self.detector_px2 + np.eye(2) * self.floor_px**2
-        safe = np.where(np.isfinite(residual), residual, 1e6)
-        return np.asarray(np.sum(safe * np.linalg.solve(covariance, safe[..., None])[..., 0], axis=1))
-
     def _reject(self, residual: FloatArray) -> None:
-        self.used = self._distance2(residual) <= _OUTLIER_CHI2
+        safe = np.where(np.isfinite(residual), residual, 1e6)
+        self.used = _distance2(safe, self.detector_px2, self.floor_px) <= _OUTLIER_CHI2
         if self.used.sum() * 2 < self.problem.count + 2:
             raise NotEnoughData("most points disagree with any lens; check the target's size, its pose and the angles")
 
     def worst_view(self) -> tuple[int, str] | None:
         """(index, reason) of the picture with most outliers, if it is to be dropped."""
-        residual = self.problem.residuals(self.state)
+        residual = self._evaluation().residual_px
         worst: tuple[int, float] | None = None
         for index in range(len(self.problem.views)):
             share = 1 - float(np.mean(self.used[self.problem.view_of == index]))
@@ -311,7 +328,7 @@ class Fit:
 
     def at_minimum(self) -> Minimum:
         """Everything of the fit as it now stands."""
-        evaluation, whiten = self.problem.evaluate(self.state), self._whitening()
+        evaluation, whiten = self._evaluation(), self._whitening()
         return Minimum(evaluation, whiten, self._normal(evaluation, whiten, robust=False))
 
     def result(self, dropped: tuple[tuple[str, str], ...]) -> LevelFit:
@@ -392,14 +409,18 @@ class Fit:
         return tuple(found)
 
 
-def _whitened(whiten: FloatArray, values: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """W values for ``values`` (N, 2) or (N, 2, K), zero where not used (whatever stands there)."""
-    w11, w21, w22 = (whiten[:, i].reshape(-1, *[1] * (values.ndim - 2)) for i in range(3))
-    out = np.empty_like(values)
-    out[:, 0] = w11 * values[:, 0]
-    out[:, 1] = w21 * values[:, 0] + w22 * values[:, 1]
-    if not used.all():
-        out[~used] = 0.0
+def _distance2(residual: FloatArray, covariance: FloatArray, floor_px: float) -> FloatArray:
+    """Squared distances (N,) of residuals (N, 2) in their own standard deviations: r' C^-1 r, C with the floor."""
+    uu, uv, vv = covariance[:, 0, 0] + floor_px**2, covariance[:, 0, 1], covariance[:, 1, 1] + floor_px**2
+    u, v = residual[:, 0], residual[:, 1]
+    return np.asarray((vv * u * u - 2 * uv * u * v + uu * v * v) / (uu * vv - uv * uv))
+
+
+def _whitened(whiten: FloatArray, residual: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """W residual, (N, 2), zero where not used (whatever stands there)."""
+    u, v = residual[:, 0], residual[:, 1]
+    out = np.column_stack([whiten[:, 0] * u, whiten[:, 1] * u + whiten[:, 2] * v])
+    out[~used] = 0.0
     return out
 
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.solve.problem import OWN, Evaluation, Step
 from calibration.types import FloatArray, IntArray
@@ -37,26 +38,38 @@ class NormalEquations:
         rows: Sequence[slice],
         own_count: IntArray,
         evaluation: Evaluation,
-        residual: FloatArray,
-        shared: FloatArray,
-        own: FloatArray | None,
+        whiten: FloatArray,
+        used: NDArray[np.bool_],
     ) -> NormalEquations:
-        """From whitened residuals (N, 2) and Jacobians (N, 2, S), (N, 2, 6), each picture's points in its ``rows``."""
-        count = shared.shape[-1]
-        flat, r = shared.reshape(2 * len(residual), count), residual.ravel()
+        """From residuals and Jacobians, each picture's points in its ``rows``; ``whiten`` (N, 3) the lower triangles
+        (w11, w21, w22) by which each point is multiplied, what is not ``used`` does not count."""
+        points, _, count = evaluation.shared.shape
+        own = bool(own_count.any())
+        # (columns, 2, N): so the Jacobians lie in memory, and one product with itself is every sum that is needed.
+        stacked = np.empty((count + own * OWN + 1, 2, points))
+        stacked[:count] = evaluation.shared.T
+        if own:
+            stacked[count:-1] = evaluation.own.T
+        stacked[-1] = evaluation.residual_px.T
+        w11, w21, w22 = np.ascontiguousarray(whiten.T)
+        stacked[:, 1] *= w22
+        stacked[:, 1] += w21 * stacked[:, 0]
+        stacked[:, 0] *= w11
+        if not used.all():
+            stacked[:, :, ~used] = 0.0
+        shared = stacked[:count].reshape(count, 2 * points)
         prior = evaluation.prior_shared
-        A = flat.T @ flat + prior.T @ prior
-        g = flat.T @ r + prior.T @ evaluation.prior_residual
+        A = shared @ shared.T + prior.T @ prior
+        g = shared @ stacked[-1].ravel() + prior.T @ evaluation.prior_residual
         views = len(rows)
         B, C, h = np.zeros((views, count, OWN)), np.zeros((views, OWN, OWN)), np.zeros((views, OWN))
-        if own is not None:
-            each = own.reshape(-1, OWN)
+        if own:
             for index, part in enumerate(rows):
                 if not own_count[index]:
                     continue
-                both = slice(2 * part.start, 2 * part.stop)
-                mine = each[both]
-                B[index], C[index], h[index] = flat[both].T @ mine, mine.T @ mine, mine.T @ r[both]
+                both = stacked[:, :, part].reshape(len(stacked), -1)
+                sums = both @ both[count:-1].T
+                B[index], C[index], h[index] = sums[:count], sums[count:-1], sums[-1]
             turns = evaluation.own_prior
             C[:, :3, :3] += np.swapaxes(turns, 1, 2) @ turns
             h[:, :3] += np.einsum("vij,vi->vj", turns, evaluation.own_prior_residual)

@@ -160,7 +160,8 @@ class Problem:
         points = posed.points_m
         z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
         rays = points[:, :2] / z[:, None]
-        shared = np.zeros((len(points), 2, self.shared_count))
+        # Column by column in memory: each derivative of all points is written, whitened and summed in one go.
+        shared = np.zeros((self.shared_count, 2, len(points))).transpose(2, 1, 0)
         if self.lens_free:
             per_lens = lens.jacobian_parameters(rays)
             h = lens.half_width
@@ -171,7 +172,7 @@ class Problem:
             shared[..., 2] = per_lens[..., 2] / h**4
             shared[..., 3:5] = per_lens[..., 3:5]
         by_ray = lens.jacobian_rays(rays)
-        per_point = np.empty((len(points), 2, 3))  # px per metre
+        per_point = np.empty((3, 2, len(points))).transpose(2, 1, 0)  # px per metre
         per_point[..., :2] = by_ray / z[:, None, None]
         per_point[..., 2] = -(per_point[..., 0] * rays[:, :1] + per_point[..., 1] * rays[:, 1:])
         if self.nodal_free:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from calibration.camera import rays_of, target_points_world, world_to_camera
 from calibration.errors import NotEnoughData
 from calibration.lens import Lens
+from calibration.solve.geometry import target_points
 from calibration.solve.problem import FreePoses, View
-from calibration.types import FloatArray
+from calibration.solve.rotation import cross
+from calibration.types import FloatArray, IntArray
 
 _FOVS_DEG = (120.0, 95.0, 75.0, 60.0, 48.0, 38.0, 30.0, 22.0, 15.0, 9.0, 5.0, 3.0)
 _K1_HW = (-0.15, -0.05, 0.0, 0.05)
@@ -69,15 +71,14 @@ def _from_homographies(
     """
     middle = (np.asarray(image_size, dtype=np.float64) - 1) / 2
     squares: list[tuple[float, float]] = []
-    for view in views:
-        plane = view.target.points_m()[view.detection.point_ids]
-        if len(plane) < 4:
-            continue
-        pixels = (view.detection.points_px - middle) / [1.0, pixel_aspect] / image_size[0]
-        H, _ = cv2.findHomography(plane / max(view.target.outline_m()), pixels)
-        if H is None:
-            continue
-        (a, b), (c, d), (e, f) = (H[row, :2] for row in range(3))
+    seen = [view for view in views if len(view.detection.points_px) >= 4]
+    if not seen:
+        return None
+    board = _Boards.of(seen)
+    pixels = (board.pixels - middle) / [1.0, pixel_aspect] / image_size[0]
+    size = [max(view.target.outline_m()) for view in seen]
+    for H in board.homographies(pixels) * np.reshape(size, (-1, 1, 1)):
+        (a, b), (c, d), (e, f) = H[:, :2]
         for numerator, denominator in ((a * b + c * d, -e * f), (a * a + c * c - b * b - d * d, f * f - e * e)):
             if numerator * denominator > 0:
                 squares.append((float(numerator / denominator), float(abs(denominator))))
@@ -131,35 +132,99 @@ def _from_known_rays(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Boards:
+    """All points of some views: ``plane`` (N, 2) metres, ``pixels`` (N, 2), those of view v from ``first[v]`` on;
+    ``view_of`` (N,)."""
+
+    plane: FloatArray
+    pixels: FloatArray
+    first: IntArray
+    view_of: IntArray
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> _Boards:
+        counts = np.array([len(v.detection.points_px) for v in views])
+        plane = target_points(views)
+        pixels = np.concatenate([v.detection.points_px for v in views])
+        return cls(plane, pixels, np.cumsum(counts) - counts, np.repeat(np.arange(len(views)), counts))
+
+    def homographies(self, image: FloatArray) -> FloatArray:
+        """(V, 3, 3) from the board's plane to ``image`` (N, 2), which looks at its points from in front (h33 > 0 at
+        their middle); scaled so that it carries the middle with depth 1.
+
+        The normalised linear solution (Hartley and Zisserman, Multiple view geometry, 4.4) of all views at once: the
+        eigenvector of the least eigenvalue of each view's 9 x 9 matrix.
+        """
+        (x, y), to_plane = self._normalised(self.plane)
+        (u, v), to_image = self._normalised(image)
+        products = np.stack([x * x, x * y, x, y * y, y, np.ones_like(x)])
+        weighted = np.concatenate([products, u * products, v * products, (u * u + v * v) * products])
+        sums = np.add.reduceat(weighted, self.first, axis=1).T.reshape(-1, 4, 6)
+        blocks = sums[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 4, 3, 3)
+        matrix = np.zeros((len(blocks), 9, 9))
+        matrix[:, :3, :3] = matrix[:, 3:6, 3:6] = blocks[:, 0]
+        matrix[:, :3, 6:] = matrix[:, 6:, :3] = -blocks[:, 1]
+        matrix[:, 3:6, 6:] = matrix[:, 6:, 3:6] = -blocks[:, 2]
+        matrix[:, 6:, 6:] = blocks[:, 3]
+        H = np.linalg.eigh(matrix)[1][:, :, 0].reshape(-1, 3, 3)
+        H = H / np.where(np.abs(H[:, 2:, 2:]) > 1e-12, H[:, 2:, 2:], np.nan)
+        return np.asarray(np.linalg.inv(to_image) @ H @ to_plane)
+
+    def _normalised(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (2, N) with each view's mean at 0 and a mean square of 1, and the matrices (V, 3, 3) that do it."""
+        counts = np.diff(np.append(self.first, len(points)))[:, None]
+        mean = np.add.reduceat(points, self.first, axis=0) / counts
+        off = points - mean[self.view_of]
+        spread = np.sqrt(np.add.reduceat(off**2, self.first, axis=0).sum(axis=1) / (2 * counts[:, 0]))
+        scale = 1 / np.maximum(spread, 1e-300)
+        matrix = np.zeros((len(scale), 3, 3))
+        matrix[:, 0, 0] = matrix[:, 1, 1] = scale
+        matrix[:, :2, 2], matrix[:, 2, 2] = -scale[:, None] * mean, 1.0
+        return (off * scale[self.view_of, None]).T, matrix
+
+
 def _poses(free: dict[int, View], lens: Lens) -> tuple[FreePoses, float]:
-    """Camera-from-target poses for ``lens`` and the RMS distance in px that they leave (infinite if none fits)."""
-    poses: FreePoses = {}
-    squares, count = 0.0, 0
-    for index, view in free.items():
-        plane = view.target.points_m()[view.detection.point_ids]
-        points = np.column_stack([plane, np.zeros(len(plane))])
-        rays = lens.unproject(view.detection.points_px)
-        if len(points) < 4 or not np.isfinite(rays).all():
-            return _fallback(free, lens), math.inf
-        try:
-            found, R_vectors, t_vectors, errors = cv2.solvePnPGeneric(
-                points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-            )
-        except cv2.error:
-            return _fallback(free, lens), math.inf
-        if not found:
-            return _fallback(free, lens), math.inf
-        best = int(np.argmin(np.asarray(errors).ravel()))
-        R_ct = np.asarray(cv2.Rodrigues(R_vectors[best])[0], dtype=np.float64)
-        t_ct_m = np.asarray(t_vectors[best], dtype=np.float64).ravel()
-        poses[index] = R_ct, t_ct_m
-        back = lens.project(rays_of(points @ R_ct.T + t_ct_m))
-        distance = back - view.detection.points_px
-        if not np.isfinite(distance).all():
-            return _fallback(free, lens), math.inf
-        squares += float(np.sum(distance**2))
-        count += len(points)
-    return poses, math.sqrt(squares / count) if count else 0.0
+    """Camera-from-target poses for ``lens`` and the RMS distance in px that they leave (infinite if none fits).
+
+    The nearest rotation to each homography's first two columns, and its mirror image along the line of sight: a board
+    without visible perspective looks the same either way, so the better of the two counts.
+    """
+    if not free:
+        return {}, 0.0
+    views = [*free.values()]
+    if min(len(view.detection.points_px) for view in views) < 4:
+        return _fallback(free, lens), math.inf
+    board = _Boards.of(views)
+    rays = lens.unproject(board.pixels)
+    if not np.isfinite(rays).all():
+        return _fallback(free, lens), math.inf
+    H = board.homographies(rays)
+    if not np.isfinite(H).all():
+        return _fallback(free, lens), math.inf
+    scale = np.linalg.norm(H[:, :, :2], axis=1).mean(axis=1)[:, None, None]
+    left, _, right = np.linalg.svd(H[:, :, :2] / scale, full_matrices=False)
+    first_two, t = left @ right, H[:, :, 2] / scale[:, :, 0]
+    middle = np.add.reduceat(board.plane, board.first, axis=0)
+    middle /= np.diff(np.append(board.first, len(board.plane)))[:, None]
+    centre = np.einsum("vij,vj->vi", first_two, middle) + t
+    sight = centre / np.linalg.norm(centre, axis=1, keepdims=True)
+    other = first_two - 2 * sight[:, :, None] * np.einsum("vi,vij->vj", sight, first_two)[:, None, :]
+    candidates = (first_two, t), (other, centre - np.einsum("vij,vj->vi", other, middle))
+    squares = []
+    for columns, shift in candidates:
+        points = np.einsum("nij,nj->ni", columns[board.view_of], board.plane) + shift[board.view_of]
+        distance = np.sum((lens.project(rays_of(points)) - board.pixels) ** 2, axis=1)
+        squares.append(np.add.reduceat(np.where(np.isfinite(distance), distance, np.inf), board.first))
+    mirrored = squares[1] < squares[0]
+    least = np.minimum(squares[0], squares[1])
+    if not np.isfinite(least).all():
+        return _fallback(free, lens), math.inf
+    columns = np.where(mirrored[:, None, None], other, first_two)
+    shift = np.where(mirrored[:, None], candidates[1][1], t)
+    R = np.concatenate([columns, cross(columns[:, :, 0], columns[:, :, 1])[:, :, None]], axis=2)
+    poses = {index: (R[place], shift[place]) for place, index in enumerate(free)}
+    return poses, math.sqrt(float(least.sum()) / len(board.pixels))
 
 
 def _fallback(free: dict[int, View], lens: Lens) -> FreePoses:
