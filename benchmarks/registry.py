@@ -58,6 +58,9 @@ BENCHMARKS = {
             "levels", "the joint and the study's alternating method on the same simulated studio", "benchmarks.levels"
         ),
         Benchmark("detect", "finding a chessboard, beside OpenCV's detectors", "benchmarks.detect"),
+        Benchmark(
+            "coverage", "whether errors lie within their sigmas, over random lenses and pictures", "benchmarks.coverage"
+        ),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
         Benchmark(
             "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"
