@@ -24,6 +24,7 @@ from calibration.tables import Frames, LeftOut, LensTable, LevelResult, LevelSta
 from calibration.types import Refusal
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import PictureFolder
+from storage.evidence import summary_of
 
 Progress = Callable[[float, str], None]
 """Told how far the work is (0..1) and what is being done."""
@@ -153,7 +154,8 @@ def _solve(
         versions=versions(),
     )
     evidence = level_evidence(fit, inputs, held_out)
-    return SetLevel(replace(result, frames=Frames(real=len(pictures))), fit, tuple(views), evidence)
+    result = replace(result, frames=Frames(real=len(pictures)), evidence=summary_of(evidence))
+    return SetLevel(result, fit, tuple(views), evidence)
 
 
 def _sha256(data: bytes) -> str:

@@ -61,6 +61,9 @@ BENCHMARKS = {
         Benchmark(
             "nodal", "the nodal offset from targets at one and two distances, beside public ways", "benchmarks.nodal"
         ),
+        Benchmark(
+            "coverage", "whether errors lie within their sigmas, over random lenses and pictures", "benchmarks.coverage"
+        ),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
         Benchmark(
             "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"

@@ -136,6 +136,40 @@ class Parallax:
 
 
 @dataclass(frozen=True, slots=True)
+class EvidenceSummary:
+    """What a level's numbers rest on, in short; the whole of it is the level's evidence document.
+
+    ``noise_floor_px``: noise that the pictures have beyond what the detector promises. ``worst_picture`` and
+    ``worst_picture_p``: the picture whose residuals noise explains least, and the chance of larger ones.
+    ``coverage_share``: of the cells of the frame, how many have points; ``radius_share``: the farthest point's
+    distance from the principal point over the farthest corner's. ``fold_margin``: radius of the lens's fold over the
+    corner's, None: never. ``misfit``: the term that the lens lacks for certain, None: nothing; ``misfit_px``: how far
+    the lens is off for it. ``mistakes``: those of survey, board, head and camera that the pictures show.
+    ``inputs_sha256``: of the inputs in the evidence document as canonical JSON.
+    """
+
+    noise_floor_px: float
+    worst_picture: str
+    worst_picture_p: float | None
+    coverage_share: float
+    radius_share: float
+    fold_margin: float | None
+    misfit: str | None
+    misfit_px: float | None
+    mistakes: tuple[str, ...]
+    inputs_sha256: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "worst_picture", _storable(self.worst_picture))
+        object.__setattr__(self, "mistakes", tuple(_storable(text) for text in self.mistakes))
+        for name in ("noise_floor_px", "coverage_share", "radius_share"):
+            _not_negative(f"evidence {name}", getattr(self, name))
+        for name in ("worst_picture_p", "fold_margin", "misfit_px"):
+            if getattr(self, name) is not None:
+                _not_negative(f"evidence {name}", getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True)
 class EngineValues:
     """What an engine is to be told for a level where that is not the level's own lens: the same quantities, in the
     product's conventions, as the studio profile converts them."""
@@ -171,7 +205,7 @@ class LevelResult:
     left out of the fit. ``predicted_overlay_px``: overlay error expected from the covariance. ``engine_overlay_px``:
     corners of the engine's own last render at the coefficients as published. ``engine_values``: what the engine must
     be told to draw this lens, None where that is the lens itself. ``parallax``: the operator's no-parallax check as a
-    number, where the nodal offset was measured.
+    number, where the nodal offset was measured. ``evidence``: what the numbers rest on, None where it was not kept.
 
     ``scenario`` 1, 2, 3 of the study (chapter 4.3), None where the method knows none. ``seconds``: how long the level
     took. ``reason``: why a level is degraded or failed. ``reasons``: why a quantity of :data:`REASON_KEYS` is None;
@@ -199,6 +233,7 @@ class LevelResult:
     engine_overlay_px: PixelError | None = None
     engine_values: EngineValues | None = None
     parallax: Parallax | None = None
+    evidence: EvidenceSummary | None = None
     scenario: int | None = None
     frames: Frames = Frames()
     seconds: float | None = None

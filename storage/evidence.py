@@ -6,6 +6,7 @@ of expected overlay error is not stored: it follows from the lens and its covari
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -18,13 +19,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from calibration import tables
 from calibration.errors import CalibrationError
 from calibration.solve.evidence import LevelEvidence, LevelInputs
-from calibration.solve.mistakes import Priors
+from calibration.solve.mistakes import Priors, Verdict
 from calibration.solve.problem import View
 from calibration.types import CameraPose, Detection, Quality, Target, TargetKind, TargetPose
 from storage.errors import BadDocument
 
 EVIDENCE_VERSION = 1
 EVIDENCE_FILE = "evidence.json"
+_VERDICTS = (Verdict.SHOWN, Verdict.NOT_SHOWN, Verdict.UNTOLD)
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Triple = tuple[Number, Number, Number]
@@ -193,6 +195,28 @@ class MisfitDocument(_Document):
     tests: tuple[TestDocument, ...]
 
 
+class MistakeDocument(_Document):
+    """A possible mistake of survey, board, head or camera, in its unit; prior_sigma: how large it was taken to be."""
+
+    name: str
+    subject: str = Field(description="the target it belongs to; empty: the head's or the camera's")
+    unit: str
+    estimate: Number
+    sigma: Number | None
+    prior_sigma: Number
+    verdict: Literal["shown", "not shown", "cannot be told"]
+
+
+class ParallaxDocument(_Document):
+    """The operator's no-parallax check: how far a near thing moves against a far one while the camera pans, px."""
+
+    near_m: Number
+    far_m: Number
+    pan_deg: Number
+    as_given_px: Number
+    sigma_px: Number
+
+
 class EvidenceDocument(_Document):
     """What a level's numbers rest on (version 1 of the format)."""
 
@@ -214,6 +238,8 @@ class EvidenceDocument(_Document):
     coverage: CoverageDocument
     fold_margin: Number | None = Field(description="fold radius over the frame's corner radius; null: never folds")
     misfit: MisfitDocument
+    mistakes: tuple[MistakeDocument, ...] = Field(default=(), description="those shown first")
+    parallax: ParallaxDocument | None = None
     inputs: InputsDocument
 
 
@@ -261,8 +287,32 @@ def evidence_to_document(evidence: LevelEvidence) -> dict[str, Any]:
             **_plain(misfit, "radial_px", "tangential_px", "neighbours"),
             "tests": [_plain(test, "name", "statistic", "dof", "p_value", "size_px") for test in misfit.tests],
         },
+        "mistakes": [
+            _plain(mistake, "name", "subject", "unit", "estimate", "sigma", "prior_sigma")
+            | {"verdict": mistake.verdict.value}
+            for mistake in sorted(evidence.mistakes, key=lambda mistake: _VERDICTS.index(mistake.verdict))
+        ],
+        "parallax": None if evidence.parallax is None else asdict(evidence.parallax),
         "inputs": _inputs(inputs),
     }
+
+
+def summary_of(evidence: LevelEvidence) -> tables.EvidenceSummary:
+    """The evidence in short, as it stands in the lens table."""
+    worst = min(evidence.pictures, key=lambda picture: math.inf if math.isnan(picture.p_value) else picture.p_value)
+    missing = evidence.misfit.missing
+    return tables.EvidenceSummary(
+        noise_floor_px=evidence.noise.floor_px,
+        worst_picture=worst.name,
+        worst_picture_p=_finite(worst.p_value),
+        coverage_share=evidence.coverage.share,
+        radius_share=evidence.coverage.radius_share,
+        fold_margin=_finite(evidence.fold_margin),
+        misfit=None if missing is None else missing.name,
+        misfit_px=None if missing is None else missing.size_px,
+        mistakes=tuple(str(mistake) for mistake in evidence.mistakes if mistake.verdict is Verdict.SHOWN),
+        inputs_sha256=hashlib.sha256(canonical_text(_inputs(evidence.inputs)).encode()).hexdigest(),
+    )
 
 
 def _inputs(inputs: LevelInputs) -> dict[str, Any]:

@@ -114,6 +114,21 @@ class ParallaxDocument(_Document):
     sigma_px: NotNegative = Field(description="by one sigma of the nodal offset found")
 
 
+class EvidenceSummaryDocument(_Document):
+    """What a level's numbers rest on, in short; the level's evidence document has the rest."""
+
+    noise_floor_px: NotNegative = Field(description="noise beyond what the detector promises")
+    worst_picture: Text = Field(description="the picture whose residuals noise explains least")
+    worst_picture_p: NotNegative | None = Field(default=None, description="chance of larger residuals than its")
+    coverage_share: NotNegative = Field(description="share of the frame's cells with measured points")
+    radius_share: NotNegative = Field(description="farthest point's distance from the centre over the corner's")
+    fold_margin: NotNegative | None = Field(default=None, description="fold's radius over the corner's; null: never")
+    misfit: Text | None = Field(default=None, description="the term that the lens lacks for certain; null: nothing")
+    misfit_px: NotNegative | None = Field(default=None, description="how far the lens is off for it, at most")
+    mistakes: tuple[Text, ...] = Field(default=(), description="of survey, board, head and camera, as shown")
+    inputs_sha256: Text = Field(description="of the evidence document's inputs as canonical JSON")
+
+
 class LeftOutDocument(_Document):
     """A picture that the fit did not use, and why."""
 
@@ -163,6 +178,9 @@ class LevelDocument(_Document):
     )
     parallax: ParallaxDocument | None = Field(
         default=None, description="the operator's no-parallax check, where the nodal offset was measured"
+    )
+    evidence: EvidenceSummaryDocument | None = Field(
+        default=None, description="what the numbers rest on; null: it was not kept"
     )
     scenario: Literal[1, 2, 3] | None = Field(default=None, description="as in the study, chapter 4.3")
     frames: FramesDocument | None = None
@@ -248,6 +266,7 @@ def level_to_document(level: tables.LevelResult) -> dict[str, Any]:
         "engine_overlay_px": _pixel_error(level.engine_overlay_px),
         **({} if level.engine_values is None else {"engine_values": _engine_values(level.engine_values)}),
         **({} if level.parallax is None else {"parallax": asdict(level.parallax)}),
+        **({} if level.evidence is None else {"evidence": _evidence(level.evidence)}),
         "scenario": None if level.scenario is None else int(level.scenario),
         "frames": {"real": int(level.frames.real), "virtual": int(level.frames.virtual)},
         "seconds": _optional(level.seconds),
@@ -322,6 +341,7 @@ def _level(
             sigma=tables.Sigma(**read.sigma.model_dump()) if read.sigma else tables.Sigma(),
             frames=tables.Frames(**read.frames.model_dump()) if read.frames else tables.Frames(),
             parallax=tables.Parallax(**read.parallax.model_dump()) if read.parallax else None,
+            evidence=tables.EvidenceSummary(**read.evidence.model_dump()) if read.evidence else None,
             engine_values=tables.EngineValues(**read.engine_values.model_dump()) if read.engine_values else None,
             left_out=tuple(tables.LeftOut(left.picture, left.reason) for left in read.left_out),
             reason=reason,
@@ -376,6 +396,10 @@ def _pair(value: tuple[float, float] | None) -> list[float] | None:
 
 def _pixel_error(value: tables.PixelError | None) -> dict[str, float] | None:
     return None if value is None else {"rms": float(value.rms), "max": float(value.max)}
+
+
+def _evidence(summary: tables.EvidenceSummary) -> dict[str, Any]:
+    return asdict(summary) | {"mistakes": list(summary.mistakes)}
 
 
 def _engine_values(values: tables.EngineValues) -> dict[str, Any]:

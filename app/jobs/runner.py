@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from typing import Any
@@ -53,7 +53,7 @@ from calibration.types import TargetKind
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import LensValues, RenderEngine
 from storage.errors import StaleState, StorageError
-from storage.evidence import canonical_text, evidence_to_document
+from storage.evidence import canonical_text, evidence_to_document, summary_of
 from storage.records import JobRecord, JobState, PictureKind
 from storage.repository import Repository
 
@@ -115,12 +115,16 @@ def _pictures(
     return level_pictures(outcome, task, pixel_aspect, as_found=as_found, expected=expected)
 
 
-def _evidence(outcome: LevelOutcome, method: LevelMethod, task: LevelTask) -> str | None:
-    """The level's evidence as its document; None for a level without a fit, or of a method that has none."""
+def _with_evidence(outcome: LevelOutcome, method: LevelMethod, task: LevelTask) -> tuple[LevelOutcome, str | None]:
+    """The level with its evidence in short, and that as its document; None without a fit, or of a method that has
+    none."""
     if not isinstance(method, JointMethod):
-        return None
+        return outcome, None
     evidence = evidence_or_none(method.fit, method.views, task, outcome.result, outcome.hashes)
-    return None if evidence is None else canonical_text(evidence_to_document(evidence))
+    if evidence is None:
+        return outcome, None
+    result = replace(outcome.result, evidence=summary_of(evidence))
+    return replace(outcome, result=result), canonical_text(evidence_to_document(evidence))
 
 
 async def _lens_as_found(engine: RenderEngine) -> LensValues | None:
@@ -309,9 +313,9 @@ class JobRunner:
             task = level_task(request, zoom, focus, results, model)
             method = make_method(request, task)
             outcome, problem = await self._level(job_id, ordinal, method, task, taker, lease)
+            outcome, evidence = await self._cpu.run(_with_evidence, outcome, method, task)
             results.append(outcome.result)
             pictures = partial(_pictures, outcome, method, task, request.pixel_aspect, as_found)
-            evidence = await self._cpu.run(_evidence, outcome, method, task)
             await self._commit(job_id, ordinal, outcome.result, evidence)
             # Drawn while the next level is measured; one level's pictures at a time are held in memory.
             await drawing.finish()

@@ -42,6 +42,17 @@ class PictureBar:
 
 
 @dataclass(frozen=True, slots=True)
+class MistakeRow:
+    """A possible mistake of survey, board, head or camera; ``shown``: the pictures show it."""
+
+    name: str
+    estimate: str
+    prior: str
+    verdict: str
+    shown: bool
+
+
+@dataclass(frozen=True, slots=True)
 class EvidenceView:
     """What the page says of a level's evidence."""
 
@@ -55,6 +66,7 @@ class EvidenceView:
     cells: tuple[tuple[int, ...], ...]
     outliers: tuple[tuple[str, str, str, str], ...]
     hashes: tuple[tuple[str, str], ...]
+    mistakes: tuple[MistakeRow, ...]
 
 
 def evidence_view(document: Mapping[str, Any]) -> EvidenceView:
@@ -86,13 +98,26 @@ def evidence_view(document: Mapping[str, Any]) -> EvidenceView:
             for o in document["outliers"]
         ),
         hashes=tuple((p["name"], p["sha256"] or "unknown") for p in document["inputs"]["pictures"]),
+        mistakes=tuple(_mistake(mistake) for mistake in document.get("mistakes", ())),
+    )
+
+
+def _mistake(mistake: Mapping[str, Any]) -> MistakeRow:
+    name, subject, unit = mistake["name"], mistake["subject"], mistake["unit"]
+    sigma = "–" if mistake["sigma"] is None else f"{mistake['sigma']:.2g}"
+    return MistakeRow(
+        f"{name} of {subject}" if subject else name,
+        f"{mistake['estimate']:+.3g} ± {sigma} {unit}".replace("-", "−").rstrip(),
+        f"{mistake['prior_sigma']:.2g} {unit}".rstrip(),
+        mistake["verdict"],
+        mistake["verdict"] == "shown",
     )
 
 
 def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     noise, coverage = document["noise"], document["coverage"]
-    fold = document["fold_margin"]
-    return [
+    fold, parallax = document["fold_margin"], document.get("parallax")
+    facts = [
         ("noise expected / found", f"{pixels(noise['expected_px'])} / {pixels(noise['found_px'])} px"),
         ("floor added", f"{pixels(noise['floor_px'])} px"),
         ("chi2 / degrees of freedom", f"{document['chi2']:.0f} / {document['dof']:.0f}"),
@@ -101,6 +126,12 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("corners expected to", f"{_or_none(coverage['corner_px'])} px"),
         ("fold", "never" if fold is None else f"at {fold:.2f} × the corner's radius"),
     ]
+    if parallax is not None:
+        near_m, far_m, pan_deg = parallax["near_m"], parallax["far_m"], parallax["pan_deg"]
+        as_given, sigma = pixels(parallax["as_given_px"]), pixels(parallax["sigma_px"])
+        name = f"parallax of {near_m:.3g} m against {far_m:.3g} m, pan over {pan_deg:.3g}°"
+        facts.append((name, f"{as_given} px with the nodal offset as given, ± {sigma} px"))
+    return facts
 
 
 def _correlation(value: float) -> Correlation:

@@ -164,6 +164,11 @@ class Fit:
             slice(int(end) - len(v.detection.points_px), int(end)) for v, end in zip(views, ends, strict=True)
         ]
 
+    @property
+    def noise_px(self) -> float:
+        """RMS per coordinate of what the detector promises of all points."""
+        return math.sqrt(float(np.mean(np.trace(self.detector_px2, axis1=1, axis2=2))) / 2)
+
     def free_poses(self) -> FreePoses:
         """The poses that were free, as they now stand."""
         return {int(i): (self.state.R[i], self.state.t[i]) for i in np.flatnonzero(self.problem.own_count == OWN)}

@@ -153,13 +153,16 @@ def _first_fit(kept: list[View], known: _Known) -> Fit:
         quick = fitted_from(False)
     except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
         return fitted_from(True)
-    if quick.floor_px <= MISFIT_PX and not quick.state.lens.folds_inside():
+    # From afar a board in its mirrored pose looks nearly the same, and a lens can be bent to suit a few such mistakes:
+    # only residuals that the detector's noise explains say that none was made.
+    explained = quick.floor_px <= quick.noise_px and quick.worst_view() is None
+    if explained and not quick.state.lens.folds_inside():
         return quick
     try:
         thorough = fitted_from(True)
     except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
         return quick
-    return thorough if thorough.floor_px < quick.floor_px else quick
+    return min(quick, thorough, key=lambda fit: (fit.worst_view() is not None, fit.floor_px))
 
 
 def _odd_one_out(kept: list[View], fitted: Fit) -> tuple[int, str] | None:

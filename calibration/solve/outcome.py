@@ -14,6 +14,7 @@ from calibration.solve.center_shift import center_shift_from_centre
 from calibration.solve.engine_check import EngineAgreement
 from calibration.solve.iteration import LevelFit
 from calibration.solve.level import MISFIT_PX
+from calibration.solve.misfit import Minimum, coverage_of, misfit_of
 from calibration.solve.nodal import MEASURED_MM
 from calibration.solve.problem import View
 from calibration.tables import (
@@ -148,9 +149,14 @@ def _useless(fit: LevelFit, expected_max_px: float) -> str | None:
 def _trouble(fit: LevelFit, expected_max_px: float) -> list[str]:
     trouble: list[str] = []
     if not math.isfinite(expected_max_px) or expected_max_px > USABLE_OVERLAY_PX:
-        trouble.append(
-            f"expected overlay error up to {expected_max_px:.1f} px: take more pictures, the target nearer the corners"
-        )
+        advice = "take more pictures, the target nearer the corners"
+        coverage = coverage_of(fit)
+        if coverage.radius_share < 1 and coverage.corner_px > USABLE_OVERLAY_PX:
+            advice = (
+                f"the frame's corners are extrapolated, points reach {coverage.radius_share:.0%} of the way to them: "
+                f"{advice}"
+            )
+        trouble.append(f"expected overlay error up to {expected_max_px:.1f} px: {advice}")
     if fit.nodal_told and fit.sigma_nodal_mm is not None and fit.sigma_nodal_mm > MEASURED_MM:
         trouble.append(
             f"the nodal offset is known to {fit.sigma_nodal_mm:.1f} mm only and shows as field of view: add a target "
@@ -161,6 +167,12 @@ def _trouble(fit: LevelFit, expected_max_px: float) -> list[str]:
         trouble.append(
             f"residuals of {fit.rms_px:.1f} px are far above what the pictures' noise explains (most in {worst.name}): "
             "a pose, the survey or the target's size is wrong"
+        )
+    missing = misfit_of(fit, Minimum.of(fit)).missing if fit.solved is not None else None
+    if missing is not None and missing.size_px is not None and missing.size_px > ENGINE_AGREES_PX:
+        trouble.append(
+            f"{missing.name} (p = {missing.p_value:.1g}): k1 and k2 do not describe this lens, it is off by up to "
+            f"{missing.size_px:.2f} px in the frame"
         )
     if fit.untold:
         trouble.append(f"not told by the pictures: {', '.join(fit.untold)}")

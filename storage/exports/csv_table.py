@@ -80,8 +80,9 @@ _LEVEL_COLUMNS: dict[str, tuple[_Path, str]] = {
     "reasons": (("reasons",), _JSON),
     "engine_values": (("engine_values",), _JSON),
     "parallax": (("parallax",), _JSON),
+    "evidence": (("evidence",), _JSON),
 }
-_LATER_COLUMNS = ("engine_values", "parallax")
+_LATER_COLUMNS = ("engine_values", "parallax", "evidence")
 """Columns that files of earlier versions do not have; without one, nothing of it is told."""
 
 
