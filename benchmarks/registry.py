@@ -59,6 +59,7 @@ BENCHMARKS = {
         ),
         Benchmark("detect", "finding a chessboard, beside OpenCV's detectors", "benchmarks.detect"),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
+        Benchmark("level", "one level's fit, beside OpenCV, mrcal and the study's method", "benchmarks.level"),
         Benchmark(
             "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"
         ),
