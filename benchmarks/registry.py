@@ -65,6 +65,7 @@ BENCHMARKS = {
             "coverage", "whether errors lie within their sigmas, over random lenses and pictures", "benchmarks.coverage"
         ),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
+        Benchmark("level", "one level's fit, beside OpenCV, mrcal and the study's method", "benchmarks.level"),
         Benchmark(
             "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"
         ),
