@@ -7,6 +7,11 @@ from collections.abc import Callable
 from benchmarks import detect_boards
 
 PARTS = (detect_boards.run,)
+PLOTS = (
+    ("rmse_px", "error per coordinate, px"),
+    ("vs_crb", "error over what the covariance says"),
+    ("cpu_ms", "processor time, ms"),
+)
 
 
 def run(*, quick: bool, progress: Callable[[float], None] | None = None) -> list[dict[str, object]]:

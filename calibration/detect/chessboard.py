@@ -23,7 +23,7 @@ from calibration.types import (
 )
 
 LEAST_MEASURED = 0.8
-"""At least this share of the corners must be measured."""
+"""At least this share of the corners that the frame does not cut off must be measured."""
 LARGEST_BLUR_SHARE = 0.27
 """A board whose blur (sigma) exceeds this share of a square's side is refused."""
 
@@ -57,7 +57,8 @@ def _judged(measured: Measured, board: Board, target: Target) -> DetectionResult
     places = np.column_stack([np.tile(np.arange(columns), rows), np.repeat(np.arange(rows), columns)])
     parity = (-1) ** places.sum(axis=1)
     gain = state.gain * -board.polarity * parity
-    usable = np.isfinite(fit.chi2) & np.isfinite(fit.covariance_px2).all(axis=(1, 2)) & (gain > 0)
+    seen = board.seen.ravel()
+    usable = seen & np.isfinite(fit.chi2) & np.isfinite(fit.covariance_px2).all(axis=(1, 2)) & (gain > 0)
     if not usable.any():
         return Refusal("no corner of the board could be fitted to the pixels (too dark, too blurred or too noisy)")
     blur_all = float(np.median(state.sigma_px[usable]))
@@ -77,8 +78,10 @@ def _judged(measured: Measured, board: Board, target: Target) -> DetectionResult
         & (state.sigma_px < max(2.5 * blur_all, blur_all + 1))
     )
     usable = _without_strays(usable, places, state.points_px)
-    if usable.sum() < LEAST_MEASURED * total:
-        return Refusal(f"only {int(usable.sum())} of {total} inner corners could be measured (hidden or too blurred)")
+    if usable.sum() < LEAST_MEASURED * seen.sum():
+        return Refusal(
+            f"only {int(usable.sum())} of {int(seen.sum())} inner corners could be measured (hidden or too blurred)"
+        )
     ids = np.nonzero(usable)[0]
     points = state.points_px[ids]
     covariance = fit.covariance_px2[ids] * np.maximum(fit.chi2[ids], 1.0)[:, None, None] + measured.aliasing_px2[ids]

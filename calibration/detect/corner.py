@@ -1,13 +1,13 @@
 """Fine measurement: the maximum-likelihood fit of a blurred corner to the pixels, all corners of a board at once.
 
-Two edges cross at (x, y). With signed distances d1, d2 to the edges, blurred by a Gaussian of sigma s,
+Two edges cross at (x, y). With signed distances d1, d2 to the edges, and a blur of the standard deviation s,
 
-    I = o + g F,   F = E(d1) E(d2) + (2 / pi) (rho + rho^2 a1 a2 / 2) exp(-(a1^2 + a2^2) / 2),
+    I = o + g F(d1 / s, d2 / s; rho),
 
-with a = d / s, E(d) = erf(a / sqrt 2), and rho the cosine between the two edges' normals: the expansion in rho, to
-second order, of the orthant probability of the bivariate normal, exact for edges that cross at a right angle. The box
-of a pixel is part of s (it adds 1/12 px^2 to the variance along any direction). An edge may be bent, as a straight line
-seen through a lens is: d is then d_line - curvature / 2 * (way along the edge)^2, the curvature known from the grid.
+F the blurred product of the edges' signs (see :mod:`calibration.detect.kernel`), rho the cosine between their normals.
+The box of a pixel is part of s (it adds 1/12 px^2 to the variance along any direction). An edge may be bent, as a
+straight line seen through a lens is: d is then d_line - curvature / 2 * (way along the edge)^2, the curvature known
+from the grid.
 
 Free for each corner: x, y, two angles, ln s, o, g. Gauss-Newton with Levenberg's damping, weights from the noise at
 the model's light, so the inverse normal matrix is the Cramer-Rao bound and is returned as the covariance.
@@ -20,17 +20,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.detect.kernel import Kernel, kernel_for
 from calibration.detect.windows import SHARPEST_SIGMA_PX, CornerState, Pixels, Windows
 from calibration.types import FloatArray, IntArray
+
+import cv2  # isort: skip  (calibration.image sets OpenCV's bound on picture sizes before its first import)
 
 PARAMETERS = 7
 _FIRST_DAMPING = 1e-3
 _LEAST_PIXELS = 21
 _SMALL_STEPS = (0.05, 0.04, 0.04)  # ln s, and offset and gain as shares of the gain
 _BLOCK_PIXELS = 16000
-_FAR = np.float32(40.0)
-"""exp(-40): far enough for any picture, and its square is still a normal float32 (those below are slow)."""
-_SIGN = np.uint32(0x80000000)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,24 +48,6 @@ class CornerFit:
     bend_px2: FloatArray
 
 
-def _erf(a: Pixels, gauss: Pixels) -> Pixels:
-    """erf(a) given ``gauss`` = exp(-a^2), to 2.5e-5: Abramowitz and Stegun 7.1.25."""
-    t = np.abs(a)
-    t *= np.float32(0.47047)
-    t += 1
-    np.reciprocal(t, out=t)
-    series = t * np.float32(0.7478556)
-    series += np.float32(-0.0958798)
-    series *= t
-    series += np.float32(0.3480242)
-    series *= t
-    series *= gauss
-    np.subtract(np.float32(1), series, out=series)
-    bits = series.view(np.uint32)
-    bits |= a.view(np.uint32) & _SIGN
-    return series
-
-
 @dataclass(slots=True, eq=False)
 class Shape:
     """The model's F over the windows and what its derivatives need."""
@@ -79,7 +61,7 @@ class Shape:
     t2: Pixels
 
 
-def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None) -> Shape:
+def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None, kernel: Kernel) -> Shape:
     """F of ``state`` (in the windows' pixels) over the windows; ``curvature`` (N, 2) or None for straight edges."""
     cos, sin = np.cos(state.angles), np.sin(state.angles)
     local = state.points_px - windows.centres
@@ -103,45 +85,19 @@ def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None)
         ways.append(t)
         distances.append(d)
     d1, d2 = distances
-    rho = np.cos(state.angles[:, :1] - state.angles[:, 1:]).astype(np.float32)
-    scale = (np.sqrt(0.5) / state.sigma_px).astype(np.float32)[:, None]
-    value, slope1, slope2 = _blurred(d1, d2, rho, scale)
+    scale = (1 / state.sigma_px).astype(np.float32)[:, None]
+    value, slope1, slope2, turned = cv2.split(kernel.at(d1 * scale, d2 * scale))
+    turned *= (np.cos(state.angles[:, :1] - state.angles[:, 1:]) - kernel.cosine).astype(np.float32)
+    value += turned
+    slope1 *= scale
+    slope2 *= scale
     return Shape(value, slope1, slope2, d1, d2, ways[0], ways[1])
-
-
-def _blurred(d1: Pixels, d2: Pixels, rho: Pixels, scale: Pixels) -> tuple[Pixels, Pixels, Pixels]:
-    """F and its derivatives with respect to d1 and d2; ``scale`` = 1 / (s sqrt 2)."""
-    a1, a2 = d1 * scale, d2 * scale
-    gauss1, gauss2 = _gauss(a1), _gauss(a2)
-    erf1, erf2 = _erf(a1, gauss1), _erf(a2, gauss2)
-    steep = scale * np.float32(2 / np.sqrt(np.pi))
-    rise1 = gauss1 * erf2
-    rise1 *= steep
-    rise2 = gauss2 * erf1
-    rise2 *= steep
-    erf1 *= erf2
-    gauss1 *= gauss2
-    # The second order of the expansion, with a = d / s = sqrt 2 d scale.
-    a1 *= a2
-    a1 *= rho
-    a1 += 1
-    a1 *= gauss1
-    a1 *= np.float32(2 / np.pi) * rho
-    erf1 += a1
-    return erf1, rise1, rise2
-
-
-def _gauss(a: Pixels) -> Pixels:
-    square = a * a
-    np.minimum(square, _FAR, out=square)
-    np.negative(square, out=square)
-    return np.asarray(np.exp(square, out=square))
 
 
 def explained(windows: Windows, state: CornerState) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(share of the windows' variance that F explains, offset, gain), (N,) each, with offset and gain solved for."""
     count = np.maximum(windows.used.sum(axis=1, dtype=np.float64), 1.0)
-    value = corner_shape(windows, state, None).value
+    value = corner_shape(windows, state, None, kernel_for(1.0, state.angles)).value
     mean = np.einsum("np,np->n", windows.used, windows.values) / count
     middle = np.einsum("np,np->n", windows.used, value) / count
     flat = value - middle[:, None].astype(np.float32)
@@ -160,7 +116,7 @@ def edge_softness(windows: Windows, state: CornerState) -> float:
 
     0 where every pixel is of one colour or the other, 0.5 where pixels are means over their area, more with a blur.
     """
-    shape = corner_shape(windows, state, None)
+    shape = corner_shape(windows, state, None, kernel_for(1.0, state.angles))
     near1, near2 = np.abs(shape.d1), np.abs(shape.d2)
     chosen = (windows.used > 0) & (np.minimum(near1, near2) < 0.5) & (np.maximum(near1, near2) > 2.0)
     offset, gain = state.offset.astype(np.float32)[:, None], state.gain.astype(np.float32)[:, None]
@@ -174,21 +130,24 @@ def fit_corners(
     curvature_per_px: FloatArray | None,
     *,
     iterations: int,
+    gaussian_share: float = 1.0,
     tolerance_px: float = 1e-3,
     loose: float = 1.0,
 ) -> CornerFit:
     """Fit all corners from ``start``; ``curvature_per_px`` (N, 2) of the two edges; at most ``iterations`` steps each.
 
-    Everything in the windows' own pixels. Angle k is that of edge k: edge 0 runs along the columns' direction, edge 1
-    along the rows'. A corner is done when a step moves it by less than ``tolerance_px``: a Gauss-Newton step leaves
-    about its own square over the blur, so the step is taken without looking again. ``loose`` widens what blur, offset
-    and gain may still change by then: they matter where covariance and residuals are asked for.
+    Everything in the windows' own pixels; ``gaussian_share`` is the blur's kind, as in :func:`kernel_for`. Angle k is
+    that of edge k: edge 0 runs along the columns' direction, edge 1 along the rows'. A corner is done when a step moves
+    it by less than ``tolerance_px``: a Gauss-Newton step leaves about its own square over the blur, so the step is
+    taken without looking again. ``loose`` widens what blur, offset and gain may still change by then: they matter where
+    covariance and residuals are asked for.
     """
     count = len(start.points_px)
     curvature = None if curvature_per_px is None else curvature_per_px.astype(np.float32)
+    kernel = kernel_for(gaussian_share, start.angles)
     best = start.copy()
     damping = np.full(count, _FIRST_DAMPING)
-    product = _products(windows, best, curvature)
+    product = _products(windows, best, curvature, kernel)
     cost = product[:, 7, 7].copy()
     active = np.isfinite(cost)
     todo = np.nonzero(active)[0]
@@ -216,7 +175,7 @@ def fit_corners(
             todo, trial = todo[rest], trial.of(rest)
             if not len(todo):
                 break
-        found = _products(windows.of(todo), trial, None if curvature is None else curvature[todo])
+        found = _products(windows.of(todo), trial, None if curvature is None else curvature[todo], kernel)
         new_cost = found[:, 7, 7]
         better = np.nonzero(np.isfinite(new_cost) & (new_cost <= cost[todo] * (1 + 1e-3)))[0]
         good = todo[better]
@@ -274,7 +233,7 @@ def shifted(angles: FloatArray, shifts_px: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj->ni", _crossing(angles), shifts_px))
 
 
-def _products(windows: Windows, state: CornerState, curvature: Pixels | None) -> FloatArray:
+def _products(windows: Windows, state: CornerState, curvature: Pixels | None, kernel: Kernel) -> FloatArray:
     """(N, 8, 8): the weighted products of the seven derivatives and, last, the residual.
 
     The first two derivatives are along the edges' normals: with respect to x and y they are sums of these two.
@@ -289,13 +248,13 @@ def _products(windows: Windows, state: CornerState, curvature: Pixels | None) ->
             state.points_px[some], state.angles[some], state.sigma_px[some], state.offset[some], state.gain[some]
         )
         product[some] = _block_products(
-            windows.block(some.start, some.stop), part, None if curvature is None else curvature[some]
+            windows.block(some.start, some.stop), part, None if curvature is None else curvature[some], kernel
         )
     return product
 
 
-def _block_products(windows: Windows, state: CornerState, curvature: Pixels | None) -> Pixels:
-    shape = corner_shape(windows, state, curvature)
+def _block_products(windows: Windows, state: CornerState, curvature: Pixels | None, kernel: Kernel) -> Pixels:
+    shape = corner_shape(windows, state, curvature, kernel)
     gain, offset = state.gain.astype(np.float32)[:, None], state.offset.astype(np.float32)[:, None]
     model = gain * shape.value
     model += offset

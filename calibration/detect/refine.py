@@ -47,6 +47,8 @@ _STEP_SHARE = 0.06
 """A step of this share of the blur leaves an error of about its square: 0.4 % of the blur."""
 _REDUCED_FROM_SIGMA_PX = ((10.0, 8), (4.5, 4), (2.2, 2))
 """Blur from which on the picture is reduced: the larger pixel's box widens the blur by less than 3 %."""
+_KINDS = (1.0, 0.6, 0.3, 0.12, 0.0)
+_KIND_FROM_SIGMA_PX = 1.2
 _SMALLEST_SIDE = 8.0
 _SLOPE_SPAN = 5
 
@@ -98,7 +100,8 @@ def refine(picture: Picture, board: Board, transfer: Transfer) -> Measured | Non
     if factor > 1:
         reach = half_px + factor
         plane = light.signal.reduced(factor, points.min(axis=0) - reach, points.max(axis=0) + reach)
-    fit, windows = _fit(plane, light, start, steps, curvature, half_px, _LAST_ITERATIONS)
+    kind = _kind_of_blur(plane, light, start, steps, curvature, half_px, good)
+    fit, windows = _fit(plane, light, start, steps, curvature, half_px, kind, _LAST_ITERATIONS)
     # The bend was taken from the rough grid: what the fine one says more moves each edge by as much.
     found = np.where(np.isfinite(fit.chi2)[:, None], fit.state.points_px, start.points_px)
     change = grid_curvature(found.reshape(*shape, 2)) - curvature
@@ -166,6 +169,62 @@ def _blur_of_a_few(
     return float(np.median(fit.state.sigma_px[fine])) if fine.any() else sigma
 
 
+def _kind_of_blur(
+    plane: Plane,
+    light: BoardLight,
+    start: CornerState,
+    steps: FloatArray,
+    curvature: FloatArray,
+    half_px: float,
+    good: NDArray[np.bool_],
+) -> float:
+    """The Gaussian's share of the optics' variance that makes some corners' pixels likeliest: 1 a Gaussian, 0 a disk.
+
+    A blur below a pixel or so shows no kind.
+    """
+    if start.sigma_px[0] < _KIND_FROM_SIGMA_PX or not good.any():
+        return 1.0
+    known = np.nonzero(good)[0]
+    some = known[_some(len(known))]
+    part = BoardLight(light.signal, light.offset[some], light.gain[some], light.per_step[some])
+    inner, windows = _looked_at(plane, part, start.of(some), steps[some], half_px)
+    best, best_cost = 1.0, np.inf
+    for kind in _KINDS:
+        fit = fit_corners(
+            windows,
+            inner,
+            curvature[some] * plane.pixel_px,
+            iterations=_FEW_ITERATIONS,
+            gaussian_share=_gaussian_share(kind, inner),
+            tolerance_px=_STEP_SHARE * float(inner.sigma_px[0]),
+        )
+        # The median: one corner that is hidden decides nothing.
+        cost = float(np.nanmedian(fit.chi2)) if np.isfinite(fit.chi2).any() else np.inf
+        if not cost < best_cost:
+            break
+        best, best_cost, inner = kind, cost, fit.state
+    return best
+
+
+def _gaussian_share(kind: float, inner: CornerState) -> float:
+    """Of the whole blur's variance, the box of a pixel counted as a Gaussian; ``kind`` is that of the optics."""
+    box = min(PIXEL_VARIANCE_PX2 / float(np.median(inner.sigma_px)) ** 2, 1.0)
+    return box + kind * (1 - box)
+
+
+def _looked_at(
+    plane: Plane, light: BoardLight, start: CornerState, steps: FloatArray, half_px: float
+) -> tuple[CornerState, Windows]:
+    """``start`` and its strips in the plane's pixels, the fall of the light taken off."""
+    pixel = plane.pixel_px
+    inner = to_plane(plane, start)
+    shading = light.shading(steps)
+    # A change of a thousandth over the window is not worth the time.
+    flat = np.abs(shading.gain_per_px).max() * half_px < 2e-3
+    band = _BAND_SIGMAS * float(inner.sigma_px[0]) + (0.0 if pixel == 1 else 0.5)
+    return inner, strip_windows(plane, inner, steps / pixel, half_px / pixel, band, None if flat else shading)
+
+
 def _fit(
     plane: Plane,
     light: BoardLight,
@@ -173,18 +232,18 @@ def _fit(
     steps: FloatArray,
     curvature: FloatArray,
     half_px: float,
+    kind: float,
     iterations: int,
 ) -> tuple[CornerFit, Windows]:
     pixel = plane.pixel_px
-    sigma = float(start.sigma_px[0])
-    inner = to_plane(plane, start)
-    shading = light.shading(steps)
-    # A change of a thousandth over the window is not worth the time.
-    flat = np.abs(shading.gain_per_px).max() * half_px < 2e-3
-    band = _BAND_SIGMAS * float(inner.sigma_px[0]) + (0.0 if pixel == 1 else 0.5)
-    windows = strip_windows(plane, inner, steps / pixel, half_px / pixel, band, None if flat else shading)
+    inner, windows = _looked_at(plane, light, start, steps, half_px)
     fit = fit_corners(
-        windows, inner, curvature * pixel, iterations=iterations, tolerance_px=_STEP_SHARE * sigma / pixel
+        windows,
+        inner,
+        curvature * pixel,
+        iterations=iterations,
+        gaussian_share=_gaussian_share(kind, inner),
+        tolerance_px=_STEP_SHARE * float(inner.sigma_px[0]),
     )
     return (
         CornerFit(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.detect.grid import Grid, find_grids, mean_steps, predict_missing, steps_of
 from calibration.detect.prediction import Prediction
@@ -22,6 +23,7 @@ _SMALLEST_STEP_PX = 5.5
 """Grids with smaller squares, in pixels of the level they were found on, wait for a finer level."""
 _LEAST_PRESENT = 0.8
 _LEAST_REPORTED = 0.15
+_LEAST_CUT = 12
 _MARGIN_SIGMAS = 4.0
 _MATCH_SIGMAS = 5.0
 _FOLLOWED_SHARE = 0.9
@@ -34,7 +36,8 @@ class Board:
 
     ``points_px`` (rows, columns, 2), every place filled (from its neighbours where not seen); ``polarity`` as in
     :class:`Grid`; ``whole``: the outer squares lie inside the picture; ``error_px`` how far a point may be off;
-    ``plane`` the reduced channel it was found in, in coded values.
+    ``plane`` the reduced channel it was found in, in coded values; ``seen`` (rows, columns): False for the lines that
+    the frame cuts off.
     """
 
     points_px: FloatArray
@@ -42,6 +45,7 @@ class Board:
     whole: bool
     error_px: float
     plane: Reduced
+    seen: NDArray[np.bool_]
 
 
 def find_board(
@@ -73,7 +77,11 @@ def find_board(
             points = (grid.points + 0.5) * factor - 0.5 + corner
             full = Grid(points, grid.polarity, grid.amplitude)
             oriented = upright(full, size, near)
-            if oriented is None or oriented.present < _LEAST_PRESENT * size[0] * size[1]:
+            if oriented is None:
+                oriented = cut_reading(full, size, picture, near)
+            elif oriented.present < _LEAST_PRESENT * size[0] * size[1]:
+                oriented = None
+            if oriented is None:
                 others.append(full)
                 continue
             board = _board(oriented, picture, 0.3 * factor, plane)
@@ -94,7 +102,9 @@ def follow(saddles: Saddles, plane: Reduced, near: Prediction, size: tuple[int, 
     expected = (near.points_px + 0.5 - np.array(plane.origin_px)) / plane.pixel_px - 0.5
     steps = steps_of(expected.reshape(size[1], size[0], 2)).reshape(-1, 2, 2)
     side = np.linalg.norm(steps, axis=2).min(axis=1)
-    least = _FOLLOWED_SHARE * len(expected)
+    height, width = saddles.gray.shape
+    in_view = ((expected > 3) & (expected < np.array([width, height]) - 4)).all(axis=1)
+    least = _FOLLOWED_SHARE * max(int(in_view.sum()), min(_LEAST_CUT, len(expected)), len(expected) / 2)
     if _MARGIN_SIGMAS * near.sigma_px / plane.pixel_px > 0.5 * float(np.median(side)) or len(saddles.points) < least:
         return None
     # The quadrant between the two steps is bright where the bright diagonal runs along their sum.
@@ -136,12 +146,7 @@ def upright(grid: Grid, size: tuple[int, int], near: Prediction | None = None) -
     points, polarity = grid.points, grid.polarity
     for _ in range(4):
         if (points.shape[1], points.shape[0]) == size:
-            if near is None:
-                steps = mean_steps(points)
-                lengths = np.linalg.norm(steps, axis=1)
-                value = float(steps[0, 0] / lengths[0] + steps[1, 1] / lengths[1])
-            else:
-                value = -float(np.nansum((points.reshape(-1, 2) - near.points_px) ** 2))
+            value = _reading_value(points, near)
             if value > best_value:
                 best, best_value = Grid(points, polarity, grid.amplitude), value
         # A quarter turn: columns run where rows ran. The first point is the old last row's first one, and the square
@@ -149,6 +154,60 @@ def upright(grid: Grid, size: tuple[int, int], near: Prediction | None = None) -
         polarity = polarity * (-1) ** (points.shape[0] - 1) * -1
         points = np.swapaxes(points, 0, 1)[:, ::-1]
     return best
+
+
+def cut_reading(grid: Grid, size: tuple[int, int], picture: Picture, near: Prediction | None) -> Grid | None:
+    """``grid``, short of ``size`` in one direction, with the lines that the frame cuts off as NaN; None where in doubt.
+
+    The cut end is the one where a further line would be out of the picture, if the other three sides are in it; with a
+    prediction it is the end that fits it. At least half of the corners, and ``_LEAST_CUT``, must be in view.
+    """
+    best: Grid | None = None
+    best_value = -np.inf
+    points, polarity = grid.points, grid.polarity
+    least = max(_LEAST_CUT, size[0] * size[1] / 2)
+    for _ in range(4):
+        missing = (size[1] - points.shape[0], size[0] - points.shape[1])
+        if min(missing) == 0 and max(missing) > 0 and points.shape[0] * points.shape[1] >= least:
+            axis = int(np.argmax(missing))
+            out = _sides_out(points, picture)
+            for end in (0, 1):
+                # The frame tells only where this side alone is at it.
+                if near is None and not (out[axis][end] and sum(map(sum, out)) == 1):
+                    continue
+                pad = [(0, 0), (0, 0), (0, 0)]
+                pad[axis] = (missing[axis], 0) if end == 0 else (0, missing[axis])
+                read = Grid(
+                    np.pad(points, pad, constant_values=np.nan), polarity * (-1) ** pad[axis][0], grid.amplitude
+                )
+                value = _reading_value(read.points, near)
+                if value > best_value:
+                    best, best_value = read, value
+        polarity = polarity * (-1) ** (points.shape[0] - 1) * -1
+        points = np.swapaxes(points, 0, 1)[:, ::-1]
+    if best is None or best.present < _LEAST_PRESENT * grid.points.shape[0] * grid.points.shape[1]:
+        return None
+    return best
+
+
+def _reading_value(points: FloatArray, near: Prediction | None) -> float:
+    """The greater, the likelier: columns to the right and rows downwards, or near to what is expected."""
+    if near is not None:
+        return -float(np.nansum((points.reshape(-1, 2) - near.points_px) ** 2))
+    steps = mean_steps(points)
+    lengths = np.linalg.norm(steps, axis=1)
+    return float(steps[0, 0] / lengths[0] + steps[1, 1] / lengths[1])
+
+
+def _sides_out(points_px: FloatArray, picture: Picture) -> tuple[tuple[bool, bool], tuple[bool, bool]]:
+    """(top, bottom) and (left, right): whether a further line on that side is for the most part out of the picture."""
+    grown = surrounded(points_px)
+
+    def out(line: FloatArray) -> bool:
+        known = line[np.isfinite(line).all(axis=1)]
+        return len(known) > 0 and float(_inside(known, picture).mean()) < 0.5
+
+    return (out(grown[0, 1:-1]), out(grown[-1, 1:-1])), (out(grown[1:-1, 0]), out(grown[1:-1, -1]))
 
 
 def _levels(
@@ -230,13 +289,15 @@ def _open_sides(points_px: FloatArray, picture: Picture) -> tuple[int, int]:
 
 def _board(grid: Grid, picture: Picture, error_px: float, plane: Reduced) -> Board:
     points = grid.points
+    there = np.isfinite(points[..., 0])
+    seen = there.any(axis=1)[:, None] & there.any(axis=0)[None, :]
     while not np.isfinite(points).all():
         expected = predict_missing(points)
         filled = np.where(np.isfinite(points), points, expected)
         if np.isfinite(filled).sum() == np.isfinite(points).sum():
             break
         points = filled
-    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px, plane)
+    return Board(points, grid.polarity, bool(_inside(surrounded(points), picture).mean() > 0.9), error_px, plane, seen)
 
 
 def _choose(boards: list[Board], size: tuple[int, int], near: Prediction | None) -> Board | str | None:
@@ -275,4 +336,6 @@ def _reason(others: list[Grid], size: tuple[int, int], picture: Picture, near: P
     cut = ""
     if sum(_open_sides(grid.points, picture)) > 0 and columns * rows < size[0] * size[1]:
         cut = ": the board is cut by the frame"
+        if any(all(ends) for ends in _sides_out(grid.points, picture)):
+            cut += ", both ends are at it: which of the corners these are cannot be told; turn one end into view"
     return f"found {columns}x{rows} of {wanted} inner corners{place}{cut}"

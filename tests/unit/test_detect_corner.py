@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from benchmarks.blur import Blur, Disk, Gaussian
+from benchmarks.pictures import draw_board, random_view
 from calibration.detect.corner import CornerFit, explained, fit_corners
+from calibration.detect.kernel import kernel_for
+from calibration.detect.target import find_target
 from calibration.detect.windows import PIXEL_VARIANCE_PX2, CornerState, Signal, strip_windows
-from calibration.types import FloatArray, Picture
+from calibration.types import Detection, FloatArray, Picture, Target, TargetKind
 
 STEP_PX = 40
 CODES = (40.0, 200.0)
@@ -147,3 +151,31 @@ def test_a_flat_window_is_reported_not_invented() -> None:
     result = fit_corners(windows, start, None, iterations=10)
     sure = np.isfinite(result.covariance_px2).all() and np.sqrt(result.covariance_px2[0, 0, 0]) < 0.5
     assert not sure or abs(result.state.gain[0]) < 0.02
+
+
+@pytest.mark.parametrize("blur", [Disk(4.0), Disk(9.0), Gaussian(4.0)])
+def test_a_defocus_disk_is_told_from_a_gaussian_by_its_pixels(blur: Blur) -> None:
+    rng = np.random.default_rng(17)
+    drawn = draw_board((8, 8), random_view((8, 8), rng, size=(960, 720)), blur, 2.0, rng)
+    target = Target(TargetKind.CHESSBOARD, squares=(8, 8), square_m=0.05, colours=("red", "white"))
+    result = find_target(drawn.picture, target)
+    assert isinstance(result, Detection), result
+    error = result.points_px - drawn.corners
+    nees = np.mean([e @ np.linalg.solve(c, e) / 2 for e, c in zip(error, result.covariance_px2, strict=True)])
+    assert nees < 1.5
+    # With the wrong kind of blur it is 5 and more.
+    assert 0.8 < result.quality.fit_chi2 < 1.4
+    assert np.sqrt((error**2).mean()) < 0.012
+
+
+@pytest.mark.parametrize("cosine", [0.0, 0.27])
+@pytest.mark.parametrize("share", [1.0, 0.02])
+def test_tables_are_the_blurs_in_closed_form(share: float, cosine: float) -> None:
+    kernel = kernel_for(share, np.array([[0.0, np.arccos(cosine)]]))
+    a1, a2 = np.random.default_rng(3).uniform(-3, 3, (2, 1, 400))
+    value = kernel.at(a1.astype(np.float32), a2.astype(np.float32))[0]
+    found = value[:, 0] + (cosine - kernel.cosine) * value[:, 3]
+    blur = Gaussian(np.sqrt(1 - PIXEL_VARIANCE_PX2)) if share == 1 else Disk(2.0)
+    exact = blur.profile(a1) * blur.profile(a2) + blur.crossing(a1, a2, np.array(cosine))
+    # What the disk's edge has of a Gaussian here rounds its profile's ends.
+    assert np.abs(found - exact[0]).max() < (1e-3 if share == 1 else 0.03)
