@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from app.errors import TooManyListeners
-from calibration.solve.engine_learning import LearnedEngine
+from calibration.solve.engine_fit import LearnedEngine
 from calibration.tables import LevelResult, PixelError
 from storage.records import EventDraft, EventRecord
 from storage.schemas import format_utc

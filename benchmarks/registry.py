@@ -57,6 +57,11 @@ BENCHMARKS = {
         Benchmark(
             "levels", "the joint and the study's alternating method on the same simulated studio", "benchmarks.levels"
         ),
+        Benchmark(
+            "engine",
+            "renders until an engine of another kind draws the camera's lens, learned and searched",
+            "benchmarks.engine",
+        ),
         Benchmark("detect", "finding a chessboard, beside OpenCV's detectors", "benchmarks.detect"),
         Benchmark(
             "nodal", "the nodal offset from targets at one and two distances, beside public ways", "benchmarks.nodal"

@@ -9,7 +9,8 @@ from app.engines import EngineFacts
 from app.jobs.cpu import Cpu
 from app.jobs.taking import PictureTaker, observe
 from calibration.image import Transfer
-from calibration.solve.engine_learning import EngineLearning, LearnedEngine
+from calibration.solve.engine_fit import LearnedEngine
+from calibration.solve.engine_learning import EngineLearning
 from calibration.solve.engine_model import Direction, EngineModel
 from calibration.solve.search import LevelTask
 

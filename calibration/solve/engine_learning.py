@@ -1,41 +1,38 @@
 """Learning how an engine draws, from a few of its renders at known values.
 
 The engine is asked for lenses chosen so that each of its habits shows (:class:`EngineLearning`, an ask/tell object);
-the target's corners in its renders, at a known pose, are then fitted with every member of
-:class:`calibration.solve.engine_model.EngineModel`. The one that explains them is taken if it does so to the exactness
-of the corners, and clearly better than any other; else the engine is said not to be understood, and nothing is trusted.
+:mod:`calibration.solve.engine_fit` then fits its camera to the target's corners in its renders, at known poses.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares
 
-from calibration.camera import rays_of, target_points_world, world_to_camera
-from calibration.errors import InvalidInput, NotConverged
+from calibration.camera import rays_of, world_to_camera
+from calibration.errors import InvalidInput
 from calibration.lens import Lens
-from calibration.solve.engine_model import Direction, EngineModel
+from calibration.solve.engine_fit import LearnedEngine, Render, learn_engine, world_points
+from calibration.solve.engine_model import EngineModel
 from calibration.solve.search import Capture, LevelTask, Observation, Source, aim_at
-from calibration.types import CameraPose, Detection, FloatArray, Refusal, Role, Target, TargetKind
-
-FLOOR_PX = 0.02
-"""Corners of a render are believed to this at best: engines draw with few samples a pixel."""
-TRUSTED_SIGMAS = 3.0
-CLEARLY_BETTER = 2.0
-"""The next best explanation must leave this many times the residual."""
-SNAP_SIGMAS = 5.0
-SNAP_LOOSE = 0.01
-"""A gain this near to a whole number, and within five sigma of it, is that number."""
+from calibration.types import FloatArray, Refusal, Role, Target, TargetKind
 
 _FILL = 0.42
 # Height of the target in the first render, as a share of the picture's.
 _PLACE = (0.62, 0.36)
 # Where in the picture it stands: off the middle, so that the distortion shows.
+_CORNER_MARGINS = (0.04, 0.14)
+# And at last in the opposite corner, where an engine that bends in more ways than the model knows gives itself away:
+# distance kept from the picture's border, as a share of its width; the second where the target was not found.
+_CORNER_F = 0.7
+_OUTLINE = 1.4
+# A target's outline is larger than the points in it by about this.
+_LARGER, _WIDER = 2.5, 1.8
+# Other focal lengths to begin with; another axis of the field of view changes it by 16/9.
 _LARGEST_F_OF_HALF_WIDTH = 2.2
 _LEAST_RENDERS = 6
 _FIRST_K1_HW = 0.004
@@ -45,50 +42,8 @@ _MOST_BEND_HW = 0.15
 _SHIFT_PX = (14.0, 9.0)
 _NODAL_MM = 120.0
 _STALE_PX = 1e-6
-_UNSEEN_PX = 1e-3
-# What a parameter moves in all corners together, below which the renders do not show it.
-_SNAP_PX, _SNAP_NODAL = 0.2, 0.05
-_NODAL_GAINS = (1.0, -1.0, 1000.0, -1000.0, 0.001, -0.001)
-_REVERSE_STEPS = 25
-_FARTHEST = 1e5
 _NODAL_SEEN = 1e-3
 # 120 mm make a target at less than 100 m larger or smaller by more than this.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Render:
-    """A render of the engine: the lens asked for, the pose, and where the target's corners (N, 2) px were seen."""
-
-    asked: Lens
-    camera_pose: CameraPose
-    target: Target
-    detection: Detection
-
-
-@dataclass(frozen=True, slots=True)
-class LearnedEngine:
-    """What the renders tell of the engine.
-
-    ``rms_px``: what is left between the model and the corners, per coordinate; ``next_rms_px``: the same for the best
-    model of another kind; ``noise_px``: how exactly the corners were found; ``renders``: how many could be used.
-    ``trusted``: the model explains the renders and no other does; else ``reason`` says why not. ``sigma``: standard
-    deviations of the model's numbers, in the order of :data:`PARAMETERS`.
-    """
-
-    model: EngineModel
-    trusted: bool
-    rms_px: float
-    next_rms_px: float
-    noise_px: float
-    renders: int
-    reason: str = ""
-    sigma: tuple[float, ...] = ()
-
-
-PARAMETERS = ("focal_gain", "k1_gain", "k2_gain", "shift_gain_x", "shift_gain_y", "shift_offset_x_px",
-              "shift_offset_y_px", "nodal_gain", "aspect_gain")  # fmt: skip
-_SCALES = np.array([1e-2, 0.1, 0.1, 0.1, 0.1, 10.0, 10.0, 0.5, 1e-2])
-_KINDS = tuple((direction, power) for direction in Direction for power in (0, 1, -1))
 
 
 class EngineLearning:
@@ -101,18 +56,22 @@ class EngineLearning:
         self._task = task
         self._name = target or _largest(task)
         self._target = task.targets[self._name]
-        self._base = _first_lens(task, self._target)
+        self._first = self._base = _first_lens(task, self._target)
         width, height = task.image_size
         place = (_PLACE[0] * (width - 1), _PLACE[1] * (height - 1))
         self._pan, self._tilt = aim_at(self._base, task, self._target, place)
         middle = ((width - 1) / 2, (height - 1) / 2)
-        # An engine that counts the shift from another origin than the profile says draws the target out of the picture.
-        self._origins = [(0.0, 0.0), middle, (-middle[0], -middle[1])]
+        # An engine that counts the shift from another origin than the profile says draws the target out of the picture,
+        # one with another field of view too small or too large to be found.
+        origins = [(0.0, 0.0), middle, (-middle[0], -middle[1])]
+        focals = _other_focals(self._base, task, self._target)
+        self._starts = [(f_gain, origin) for f_gain in focals for origin in origins]
         self._origin = (0.0, 0.0)
         self._renders: list[Render] = []
         self._refused: list[str] = []
         self._step = 0
-        self._pending: dict[int, Lens] = {}
+        self._pending: dict[int, tuple[Capture, Lens]] = {}
+        self._margins = list(_CORNER_MARGINS)
         self._plan: list[str] = ["base"]
 
     @property
@@ -124,30 +83,34 @@ class EngineLearning:
         """The next render wanted, None while the one before must be told first."""
         if self._pending or not self._plan:
             return None
-        lens = self._lens_for(self._plan.pop(0))
-        capture = Capture(self._step, Source.VIRTUAL, self._name, self._pan, self._tilt, Role.FREE, lens=lens)
-        self._pending[self._step] = lens
+        what = self._plan.pop(0)
+        lens = self._lens_for(what)
+        pan, tilt = self._aim(what, lens)
+        capture = Capture(self._step, Source.VIRTUAL, self._name, pan, tilt, Role.FREE, lens=lens)
+        self._pending[self._step] = (capture, lens)
         self._step += 1
         return capture
 
     def tell(self, observation: Observation) -> None:
         """What was seen in a render."""
-        lens = self._pending.pop(observation.step)
+        capture, lens = self._pending.pop(observation.step)
         if isinstance(observation.result, Refusal):
             self._refused.append(observation.result.reason)
             if lens.nodal_offset_mm == _NODAL_MM:
                 # An engine that counts in metres where the profile says millimetres is out of the room.
                 self._plan.append("nodal small")
             if not self._renders:
-                if self._origins:
+                if self._starts:
                     self._plan = ["base"]
                 return
+            if capture.pan_deg != self._pan and self._margins:
+                self._plan.insert(0, "corner")
         else:
             self._renders.append(Render(lens, observation.camera_pose, self._target, observation.result))
             if lens.nodal_offset_mm == _NODAL_MM and self._nodal_unseen():
                 self._plan.append("nodal large")
             if len(self._renders) == 1:
-                self._plan = ["shift", "k1 small", "k1", "k2", "near", "far", "nodal"]
+                self._plan = ["shift", "k1 small", "k1", "k2", "near", "far", "nodal", "corner"]
 
     def result(self) -> LearnedEngine:
         """How the engine draws. Never raises: an engine that is not understood is said to be so."""
@@ -166,9 +129,10 @@ class EngineLearning:
         return learn_engine(self._renders)
 
     def _lens_for(self, what: str) -> Lens:
-        base = self._base
         if what == "base":
-            self._origin = self._origins.pop(0)
+            f_gain, self._origin = self._starts.pop(0)
+            self._base = replace(self._first, f_px=f_gain * self._first.f_px)
+        base = self._base
         bend1, bend2 = self._bends()
         x, y = _SHIFT_PX
         f_px, k1_hw, k2_hw, shift, nodal_mm = {
@@ -179,12 +143,38 @@ class EngineLearning:
             "k2": (1.0, 0.0, bend2, (0.0, 0.0), 0.0),
             "near": (1.3, -0.8 * bend1, 0.0, (-x, y), 0.0),
             "far": (0.6, bend1, bend2, (0.5 * x, -y), 0.0),
+            "corner": (_CORNER_F, self._corner_bend(bend1), 0.0, (0.0, 0.0), 0.0),
             "nodal": (1.0, 0.0, 0.0, (-x, -y), _NODAL_MM),
             "nodal small": (1.0, 0.0, 0.0, (-x, -y), _NODAL_MM / 1000),
             "nodal large": (1.0, 0.0, 0.0, (-x, -y), _NODAL_MM * 1000),
         }[what]
         place = (self._origin[0] + shift[0], self._origin[1] + shift[1])
         return replace(base, center_shift_px=place, nodal_offset_mm=nodal_mm).with_hw(f_px * base.f_px, k1_hw, k2_hw)
+
+    def _aim(self, what: str, lens: Lens) -> tuple[float, float]:
+        """Head angles (deg) for a render: the same for all but that in the corner."""
+        if what != "corner":
+            return self._pan, self._tilt
+        size_px, gain = self._seen()
+        size = np.asarray(self._task.image_size, dtype=np.float64)
+        away = _OUTLINE * _CORNER_F * size_px / 2 + self._margins.pop(0) * size[0]
+        drawn = Lens(lens.image_size, gain * lens.f_px, pixel_aspect=lens.pixel_aspect)
+        return aim_at(drawn, self._task, self._target, (float(away[0]), float(size[1] - 1 - away[1])))
+
+    def _seen(self) -> tuple[FloatArray, float]:
+        """The target's size (2,) px in the first render, and that over the size that was asked for."""
+        first = self._renders[0]
+        size_px = np.ptp(first.detection.points_px, axis=0)
+        asked = replace(first.asked, center_shift_px=(0.0, 0.0))
+        rays = rays_of(world_to_camera(first.camera_pose, 0.0, world_points(first)))
+        expected_px = np.ptp(asked.project(rays), axis=0)
+        return size_px, float(np.linalg.norm(size_px) / max(float(np.linalg.norm(expected_px)), 1e-9))
+
+    def _corner_bend(self, bend: float) -> float:
+        """k1_hw that moves corners out there about as far as ``bend`` moves those of the first render."""
+        width, height = self._task.image_size
+        reach = _radius_hw(self._renders[0], width) if self._renders else 1.0
+        return bend * (reach * width / math.hypot(width, height)) ** 3
 
     def _nodal_unseen(self) -> bool:
         """Whether the last render shows the target as large as the first, though the pupil should have moved."""
@@ -211,210 +201,6 @@ class EngineLearning:
         unit = farthest / max(expected, 1e-9)
         k2_hw = float(np.clip(_MOST_BEND_HW / max(unit, 1e-3) ** 2, 1e-9, _MOST_BEND_HW))
         return k1_hw, k2_hw
-
-
-def learn_engine(renders: Sequence[Render]) -> LearnedEngine:
-    """The model that explains the renders best: each kind fitted by least squares, the residuals compared."""
-    noise_px = _noise_px(renders)
-    corners = _Corners(renders)
-    fits = [_fitted(corners, renders, direction, power, noise_px) for direction, power in _KINDS]
-    fits.sort(key=lambda fit: fit.rms_px)
-    best = fits[0]
-    others = [fit.rms_px for fit in fits[1:] if not _same_drawing(best.model, fit.model, renders)]
-    next_px = min(others, default=math.inf)
-    snapped = _snapped(best, renders)
-    trusted, reason = True, ""
-    if snapped.rms_px > TRUSTED_SIGMAS * noise_px:
-        trusted = False
-        reason = (
-            f"no model of an engine's camera explains its renders: {snapped.rms_px:.2f} px are left, the corners are "
-            f"good to {noise_px:.3f} px"
-        )
-    elif next_px < CLEARLY_BETTER * max(snapped.rms_px, noise_px / TRUSTED_SIGMAS):
-        trusted = False
-        reason = f"two models explain the engine's renders alike ({snapped.rms_px:.3f} and {next_px:.3f} px are left)"
-    return replace(
-        snapped, trusted=trusted, reason=reason, next_rms_px=next_px, noise_px=noise_px, renders=len(renders)
-    )
-
-
-def residuals_px(model: EngineModel, render: Render) -> FloatArray:
-    """Model minus seen corners (N, 2) px of one render; NaN where the model draws nothing."""
-    drawn = model.drawn(render.asked)
-    rays = rays_of(world_to_camera(render.camera_pose, drawn.lens.nodal_offset_mm, _world(render)))
-    return np.asarray(drawn.project(rays) - render.detection.points_px)
-
-
-class _Corners:
-    """All corners of all renders in one row each, for fast trials of models: the same drawing as
-    :meth:`calibration.solve.engine_model.EngineModel.drawn`, in half widths."""
-
-    def __init__(self, renders: Sequence[Render]) -> None:
-        first = renders[0].asked
-        self.half_width_px = first.image_size[0] / 2
-        self.centre = (np.asarray(first.image_size, dtype=np.float64) - 1) / 2
-        self.aspect = first.pixel_aspect
-        parts = [
-            world_to_camera(r.camera_pose, 0.0, _world(r))[:, :3] for r in renders
-        ]  # before the pupil moves along the axis
-        self.points_m = np.concatenate(parts)
-        self.seen_px = np.concatenate([r.detection.points_px for r in renders])
-        counts = [len(part) for part in parts]
-
-        def each(value: Callable[[Lens], float]) -> FloatArray:
-            return np.repeat([value(r.asked) for r in renders], counts)
-
-        self.f_hw = each(lambda lens: lens.f_px) / self.half_width_px
-        self.k1_hw, self.k2_hw = each(lambda lens: lens.k1_hw), each(lambda lens: lens.k2_hw)
-        self.shift = np.column_stack(
-            [each(lambda lens: lens.center_shift_px[0]), each(lambda lens: lens.center_shift_px[1])]
-        )
-        self.nodal_mm = each(lambda lens: lens.nodal_offset_mm)
-
-    def misses(self, model: EngineModel) -> FloatArray:
-        """Model minus seen (M, 2) px; the picture's width where the model draws nothing."""
-        depth = self.points_m[:, 2] - model.nodal_gain * self.nodal_mm / 1000
-        f_hw = self.f_hw * model.focal_gain
-        flat = self.points_m[:, :2] / np.where(depth > 0, depth, np.nan)[:, None] * f_hw[:, None]
-        q = self.f_hw ** (2 * model.unit_power)
-        k1, k2 = model.k1_gain * self.k1_hw * q, model.k2_gain * self.k2_hw * q * q
-        radius = np.sqrt(np.sum(flat * flat, axis=1))
-        scale = _bent(radius, k1, k2, model.direction)
-        aspect = np.array([1.0, self.aspect * model.aspect_gain])
-        shift = np.asarray(model.shift_gain) * self.shift + np.asarray(model.shift_offset_px)
-        off = flat * scale[:, None] * aspect * self.half_width_px + self.centre + shift - self.seen_px
-        far = 2 * self.half_width_px
-        return np.clip(np.where(np.isfinite(off), off, far), -10 * far, 10 * far)
-
-
-def _bent(radius: FloatArray, k1: FloatArray, k2: FloatArray, direction: Direction) -> FloatArray:
-    """Distorted over undistorted radius (M,), half widths; NaN beyond the fold."""
-    if direction is Direction.FORWARD:
-        r2 = radius * radius
-        return np.where(1 + r2 * (3 * k1 + 5 * k2 * r2) > 0, 1 + r2 * (k1 + k2 * r2), np.nan)
-    r_d = radius.copy()
-    with np.errstate(all="ignore"):
-        for _ in range(_REVERSE_STEPS):
-            r2 = r_d * r_d
-            r_d = r_d - (r_d * (1 + r2 * (k1 + k2 * r2)) - radius) / (1 + r2 * (3 * k1 + 5 * k2 * r2))
-        r2 = r_d * r_d
-        solved = np.abs(r_d * (1 + r2 * (k1 + k2 * r2)) - radius) < 1e-9 * (1 + radius)
-        solved &= (r_d >= 0) & (1 + r2 * (3 * k1 + 5 * k2 * r2) > 0)
-        return np.where(solved, np.divide(r_d, radius, out=np.ones_like(radius), where=radius > 0), np.nan)
-
-
-def _world(render: Render) -> FloatArray:
-    pose = render.target.pose
-    if pose is None:
-        raise InvalidInput("target", render.target.kind.value, "learning an engine needs a posed target")
-    return target_points_world(pose, render.target.points_m()[render.detection.point_ids])
-
-
-def _fitted(
-    corners: _Corners, renders: Sequence[Render], direction: Direction, power: int, noise_px: float
-) -> LearnedEngine:
-    """One kind of model fitted to the corners, its gains of k1 and k2 counted at the first render's focal length."""
-    origin = renders[0].asked.center_shift_px
-    q = float(corners.f_hw[0]) ** (2 * power)
-
-    def model_of(x: FloatArray) -> EngineModel:
-        values = [float(value) for value in x]
-        return EngineModel(
-            direction,
-            power,
-            focal_gain=math.exp(values[0]),
-            k1_gain=values[1] / q,
-            k2_gain=values[2] / q**2,
-            shift_gain=(values[3], values[4]),
-            shift_offset_px=(values[5], values[6]),
-            nodal_gain=values[7],
-            aspect_gain=math.exp(values[8]),
-        )
-
-    def misses(x: FloatArray) -> FloatArray:
-        return corners.misses(model_of(np.clip(x, -_FARTHEST, _FARTHEST))).ravel()
-
-    best: OptimizeResult | None = None
-    for sign in (1.0, -1.0):
-        # A mirrored shift with an origin far from the middle: the offset starts where the first render is right.
-        start = np.array([0.0, 0.0, 0.0, sign, sign, -sign * origin[0], -sign * origin[1], 1.0, 0.0])
-        found = least_squares(misses, start, x_scale=_SCALES, method="trf", max_nfev=60)
-        if best is None or found.cost < best.cost:
-            best = found
-        if math.sqrt(2 * best.cost / best.fun.size) < TRUSTED_SIGMAS * noise_px:
-            break
-    if best is None:
-        raise NotConverged("the engine's model", 0, math.inf)  # two starts were made
-    rms_px = math.sqrt(2 * float(best.cost) / best.fun.size)
-    jacobian = np.asarray(best.jac)
-    strength = np.sqrt(np.sum(jacobian**2, axis=0))
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(rms_px, noise_px) ** 2
-    model = model_of(np.asarray(best.x))
-    natural = np.array([model.focal_gain, 1 / q, 1 / q**2, 1.0, 1.0, 1.0, 1.0, 1.0, model.aspect_gain])
-    sigma = np.where(strength * _SCALES > _UNSEEN_PX, np.sqrt(np.maximum(np.diag(covariance), 0.0)) * natural, np.inf)
-    if not math.isfinite(sigma[7]):
-        model = replace(model, nodal_gain=1.0)
-    return LearnedEngine(model, False, rms_px, math.inf, noise_px, len(renders), sigma=tuple(sigma.tolist()))
-
-
-def _snapped(fit: LearnedEngine, renders: Sequence[Render]) -> LearnedEngine:
-    """``fit`` with its numbers at whole values (gains at plus or minus 1, k2's at the square of k1's, offsets at 0, the
-    picture's middle or half a pixel) where that explains the renders as well."""
-    m = fit.model
-    sigma = dict(zip(PARAMETERS, fit.sigma, strict=True))
-
-    def near(name: str, value: float, candidates: Sequence[float], loose: float) -> float:
-        reach = min(SNAP_SIGMAS * sigma[name], loose)
-        return next((c for c in candidates if abs(value - c) <= max(reach, 1e-12)), value)
-
-    def gain(name: str, value: float) -> float:
-        return near(name, value, (1.0, -1.0), SNAP_LOOSE)
-
-    k1 = gain("k1_gain", m.k1_gain)
-    squares = (1.0, -1.0, k1 * k1, -k1 * k1)
-    middle = [(size - 1) / 2 for size in renders[0].asked.image_size]
-    offsets = [
-        near(
-            f"shift_offset_{axis}_px",
-            m.shift_offset_px[i],
-            [sign * middle[i] + half for sign in (0.0, 1.0, -1.0) for half in (0.0, 0.5, -0.5)],
-            _SNAP_PX,
-        )
-        for i, axis in enumerate("xy")
-    ]
-    snapped = replace(
-        m,
-        focal_gain=gain("focal_gain", m.focal_gain),
-        k1_gain=k1,
-        k2_gain=near("k2_gain", m.k2_gain, squares, SNAP_LOOSE * max(1.0, k1 * k1)),
-        shift_gain=(gain("shift_gain_x", m.shift_gain[0]), gain("shift_gain_y", m.shift_gain[1])),
-        shift_offset_px=(offsets[0], offsets[1]),
-        nodal_gain=near("nodal_gain", m.nodal_gain, _NODAL_GAINS, _SNAP_NODAL * abs(m.nodal_gain)),
-        aspect_gain=near("aspect_gain", m.aspect_gain, (1.0,), SNAP_LOOSE),
-    )
-    off = np.concatenate([residuals_px(snapped, render) for render in renders])
-    rms_px = float(np.sqrt(np.mean(off**2))) if np.isfinite(off).all() else math.inf
-    if rms_px > max(1.2 * fit.rms_px, fit.rms_px + fit.noise_px / 4):
-        return fit
-    return replace(fit, model=snapped, rms_px=rms_px)
-
-
-def _same_drawing(a: EngineModel, b: EngineModel, renders: Sequence[Render]) -> bool:
-    """Whether two models draw the learned renders' whole pictures alike: then it does not matter which is right."""
-    pixels = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.3, 0.3, 5)), axis=-1)
-    for render in renders:
-        for f_gain in (0.25, 1.0, 4.0):
-            asked = render.asked.with_hw(f_gain * render.asked.f_px, render.asked.k1_hw, render.asked.k2_hw)
-            rays = pixels * asked.image_size[0] / asked.f_px
-            apart = a.drawn(asked).project(rays) - b.drawn(asked).project(rays)
-            if not float(np.nanmax(np.abs(apart), initial=0.0)) < FLOOR_PX:
-                return False
-    return True
-
-
-def _noise_px(renders: Sequence[Render]) -> float:
-    variance = np.mean([np.trace(c) / 2 for render in renders for c in render.detection.covariance_px2])
-    return max(FLOOR_PX, math.sqrt(float(variance)))
 
 
 def _stale(renders: Sequence[Render]) -> str:
@@ -452,6 +238,13 @@ def _first_lens(task: LevelTask, target: Target) -> Lens:
     width, height = task.image_size
     f_px = min(_FILL * height / max(_angular_size(task, target), 1e-6), _LARGEST_F_OF_HALF_WIDTH * width / 2)
     return Lens(task.image_size, f_px, pixel_aspect=task.pixel_aspect)
+
+
+def _other_focals(first: Lens, task: LevelTask, target: Target) -> list[float]:
+    """By what to multiply the first focal length where the target is not found: larger where it was drawn small,
+    and then smaller."""
+    filling = _FILL * task.image_size[1] / max(_angular_size(task, target), 1e-6) / first.f_px
+    return [1.0, *([min(_LARGER, filling)] if filling > 1 else []), 1 / _WIDER]
 
 
 def _radius_hw(render: Render, width: int) -> float:

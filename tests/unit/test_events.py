@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from app import events
 from app.errors import TooManyListeners
 from calibration.lens import Lens
-from calibration.solve.engine_learning import LearnedEngine
+from calibration.solve.engine_fit import LearnedEngine
 from calibration.solve.engine_model import EngineModel
 from calibration.tables import Frames, LevelResult, PixelError
 from storage.records import EventRecord
