@@ -50,8 +50,7 @@ _OUTLIER_CHI2 = 25.0
 _VIEW_OUTLIERS = 0.3
 # A picture with more outliers than this was read wrongly as a whole (a shifted grid, a stale picture).
 _FLOOR_ROUNDS = 6
-_BISECTIONS = 44
-# To below a millionth of a millionth of the residuals.
+_FLOOR_STEPS = 60
 _PLACE = ("place across", "place in depth", "height")
 _TURN = ("turn about its columns", "turn about its rows", "turn in its plane")
 
@@ -296,21 +295,24 @@ class Fit:
         return math.sqrt(max(scatter**2 - own, 0.0))
 
     def _floor_for_chi2(self) -> float:
-        """The floor at which chi2 equals the degrees of freedom (0 if it is below them without one); bisection."""
-        residual = self._evaluation().residual_px[self.used]
-        covariance = self.detector_px2[self.used]
-        goal = self._degrees_of_freedom()
+        """The floor at which chi2 equals the degrees of freedom (0 if it is below them without one).
 
-        def chi2(floor: float) -> float:
-            return float(np.sum(_distance2(residual, covariance, floor)))
-
-        if chi2(0.0) <= goal:
-            return 0.0
-        low, high = 0.0, 10 * float(np.sqrt(np.mean(residual**2))) + 1e-9
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            low, high = (middle, high) if chi2(middle) > goal else (low, middle)
-        return high
+        Newton on 1 / chi2, which is concave in the floor's square (Moré and Sorensen's way with a trust region): it
+        comes from below and does not overshoot.
+        """
+        residual, covariance = self._evaluation().residual_px[self.used], self.detector_px2[self.used]
+        u, v = residual[:, 0], residual[:, 1]
+        uu, uv, vv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+        goal, square = self._degrees_of_freedom(), 0.0
+        for _ in range(_FLOOR_STEPS):
+            determinant = (uu + square) * (vv + square) - uv * uv
+            y_u, y_v = ((vv + square) * u - uv * v) / determinant, ((uu + square) * v - uv * u) / determinant
+            chi2 = float(u @ y_u + v @ y_v)
+            step = (chi2 / goal - 1) * chi2 / max(float(y_u @ y_u + y_v @ y_v), 1e-300)
+            if step <= 1e-13 * square:
+                break
+            square += step
+        return math.sqrt(square)
 
     def _reject(self, residual: FloatArray) -> None:
         safe = np.where(np.isfinite(residual), residual, 1e6)

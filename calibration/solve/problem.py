@@ -226,11 +226,12 @@ class Problem:
 
     def _own_priors(self, state: State) -> tuple[FloatArray, FloatArray]:
         residual, jacobian = np.zeros((len(self.views), 3)), np.zeros((len(self.views), 3, 3))
-        for index in np.flatnonzero(self.own_count == 3):
-            off = rotation_log(state.R[index])
-            inverse = self.geometry.inverse_turn_sigmas[index]
-            residual[index] = inverse @ off
-            jacobian[index] = inverse @ _log_slope(off)
+        turned = self.own_count == 3
+        if turned.any():
+            off = rotation_log(state.R[turned])
+            inverse = self.geometry.inverse_turn_sigmas[turned]
+            residual[turned] = (inverse @ off[..., None])[..., 0]
+            jacobian[turned] = inverse @ _log_slope(off)
         return residual, jacobian
 
     @property

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from calibration.types import FloatArray
@@ -32,11 +30,11 @@ def rotation_exp(w: FloatArray) -> FloatArray:
 
 
 def rotation_log(R: FloatArray) -> FloatArray:
-    """Rotation vector (3,) of a rotation matrix, radians; for angles well below pi."""
-    v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    sine = float(np.linalg.norm(v))
-    angle = math.atan2(sine, (float(np.trace(R)) - 1) / 2)
-    return np.asarray(v if sine < 1e-12 else v * angle / sine)
+    """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), radians; for angles well below pi."""
+    v = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1) / 2
+    sine = np.linalg.norm(v, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1) / 2)
+    return np.asarray(v * np.divide(angle, sine, out=np.ones_like(sine), where=sine >= 1e-12))
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

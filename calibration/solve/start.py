@@ -96,12 +96,15 @@ def _from_known_rays(
     views: Sequence[View], image_size: tuple[int, int], pixel_aspect: float, nodal_offset_mm: float
 ) -> Lens:
     width, height = image_size
+    worlds: dict[int, FloatArray] = {}
     rows: list[FloatArray] = []
     values: list[FloatArray] = []
     for view in views:
         if view.camera_pose is None or view.target.pose is None:
             continue
-        world = target_points_world(view.target.pose, view.target.points_m()[view.detection.point_ids])
+        if id(view.target) not in worlds:
+            worlds[id(view.target)] = target_points_world(view.target.pose, view.target.points_m())
+        world = worlds[id(view.target)][view.detection.point_ids]
         rays = rays_of(world_to_camera(view.camera_pose, nodal_offset_mm, world))
         ones, zeros = np.ones(len(rays)), np.zeros(len(rays))
         rows.append(np.column_stack([rays[:, 0], ones, zeros]))
