@@ -12,11 +12,11 @@ import math
 import cv2
 import numpy as np
 
-from calibration.detect.edge import fit_sides
 from calibration.detect.mask import KNOWN_COLOURS, colour_field
 from calibration.detect.prediction import Prediction
 from calibration.detect.quads import Quad, find_quads
 from calibration.detect.side import Side, corner_of
+from calibration.detect.sides import fit_sides
 from calibration.errors import InvalidInput
 from calibration.image import Transfer
 from calibration.types import (
