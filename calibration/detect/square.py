@@ -41,6 +41,8 @@ _MOST_READINGS = 2
 """How many other outlines of the chosen thing are tried where its first one has no edges."""
 _LEAST_USED = 0.35
 _MOST_SIGMA_PX = 1.0
+"""A corner less certain than this is left out; fewer than three are no target."""
+_LEAST_CORNERS = 3
 _PIXEL_VARIANCE = 1.0 / 12.0
 _ROW_BY_ROW = (0, 1, 3, 2)
 """Clockwise corners (TL, TR, BR, BL) in the target's order (TL, TR, BL, BR)."""
@@ -59,7 +61,8 @@ def find_square(
     the target's order (top left, top right, bottom left, bottom right) with their sigma: only that part is searched.
 
     Returns corners in that order, upright reading (roll within 45 degrees), with covariance (px^2), the crossing of
-    the diagonals as centre, and the Gaussian sigma of the blur without the pixel's own. A refusal gives the reason:
+    the diagonals as centre (a corner that something hides is where its sides cross; too uncertain, it is left out),
+    and the Gaussian sigma of the blur without the pixel's own. A refusal gives the reason:
     not found, cut by the frame, too small, several equally good candidates, edges too weak. Raises
     :class:`InvalidInput` for a target of another kind or a picture of the wrong shape.
     """
@@ -201,17 +204,18 @@ def _measured(
     if corners.min() < 0 or corners[:, 0].max() > width - 1 or corners[:, 1].max() > height - 1:
         return Refusal(f"the {colour} square is cut by the picture's frame")
     used = min(one.used for one in sides)
-    worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance))))
-    if used < _LEAST_USED or not math.isfinite(worst) or worst > _MOST_SIGMA_PX:
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
+    order = np.array([index for index in _ROW_BY_ROW if sigma[index] < _MOST_SIGMA_PX])
+    if used < _LEAST_USED or len(order) < _LEAST_CORNERS:
         return Refusal(
             f"the {colour} square's edges are too weak to be measured "
-            f"({used:.0%} of a side usable, corner sigma {worst:.2f} px)"
+            f"({used:.0%} of a side usable, corner sigma {np.max(sigma):.2f} px)"
         )
-    order = list(_ROW_BY_ROW)
+    worst = float(np.max(sigma[order]))
     return Detection(
         kind=TargetKind.SQUARE,
         points_px=corners[order],
-        point_ids=np.arange(4, dtype=np.int64),
+        point_ids=np.array([_ROW_BY_ROW.index(int(index)) for index in order], dtype=np.int64),
         covariance_px2=covariance[order],
         centre_px=_diagonal_crossing(corners),
         blur_px=math.sqrt(max(blur**2 - _PIXEL_VARIANCE, 0.0)),
