@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from benchmarks import detect_boards
+from benchmarks import detect_boards, detect_squares
 
-PARTS = (detect_boards.run,)
+PARTS = (detect_boards.run, detect_squares.run)
 
 
 def run(*, quick: bool, progress: Callable[[float], None] | None = None) -> list[dict[str, object]]:

@@ -14,9 +14,10 @@ from calibration.detect.strip import fit_strip
 from calibration.image import Transfer
 from calibration.types import FloatArray, Picture
 
-_ODD_CHI2 = 1.8
-"""Median squared residual over the noise from which on a side is no plain edge: a strip is tried, and what is left of
-the misfit widens the side's place."""
+_ODD_CHI2, _ODD_MISFIT = 1.8, 0.015
+"""Median squared residual over the noise, and residual over the contrast, from which on a side is no plain edge: a
+strip is tried, and what is left of the misfit widens the side's place. In pictures with hardly any noise the shape of a
+real blur shows against the first, not against the second."""
 _STRIP_ROOM_PX, _STRIP_LINES = 4.0, 80
 _SIGMA_UNKNOWN, _SIGMA_KNOWN = 1.0, 0.1
 """Shares to which the blur is known before a side with a strip is fitted, and after."""
@@ -45,7 +46,8 @@ def fit_sides(
         reach, sigma = wanted, fit.sigma
         fit = _straight(picture, curves, transfer, reach, margin, sigma)
     sigma = fit.sigma
-    margin = min(1.5 * sigma + 0.5, 0.25 * min(lengths))
+    # Within a disk's radius (2 sigma) of a corner its two sides are not seen one by one.
+    margin = min(2.1 * sigma + 0.5, 0.25 * min(lengths))
     for most_lines, tolerance_px in ((60, 0.01), (MOST_LINES, 5e-4)):
         curves = meeting(fit.curves)
         reach = min(3.2 * fit.sigma * 1.2 + 2.0, room)
@@ -55,7 +57,7 @@ def fit_sides(
     sides = fit.sides()
     if sides is None:
         return None
-    odd = [index for index, side in enumerate(sides) if side.chi2 > _ODD_CHI2]
+    odd = [index for index, side in enumerate(sides) if _is_odd(side.chi2, side.contrast)]
     if not odd:
         return sides
     wide = EdgeFit(
@@ -113,7 +115,7 @@ def _with_strip(wide: EdgeFit, index: int, plain: Side, sigma_px: float, sigma_k
         chi2=chi2,
         line_variance_px2=max(chi2, 1.0) / typical,
         density=len(good) / (2 * curve.half),
-        systematic_px=_misfit_px(chi2, freedom, typical),
+        systematic_px=_misfit_px(chi2, freedom, typical) if _is_odd(chi2, plain.contrast) else 0.0,
     )
     return side, fit.width_px > 0
 
@@ -124,4 +126,9 @@ def _misfit_px(chi2: float, freedom: float, information: float) -> float:
     Of a line's squared residuals above the noise, (chi2 - 1) times its ``freedom``, as much as all could stand for a
     move of the edge, of which ``information`` (1 / px^2) says the squares.
     """
-    return math.sqrt(max(chi2 - 1.0, 0.0) * freedom / information) if chi2 > _ODD_CHI2 else 0.0
+    return math.sqrt(max(chi2 - 1.0, 0.0) * freedom / information)
+
+
+def _is_odd(chi2: float, contrast: float) -> bool:
+    """Whether a side fits badly: against the noise, and against its ``contrast`` over the noise."""
+    return chi2 > _ODD_CHI2 and math.sqrt(chi2 - 1.0) > _ODD_MISFIT * contrast
