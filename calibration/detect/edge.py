@@ -388,6 +388,7 @@ class EdgeFit:
         starts = np.cumsum([0] + [len(curve.coefficients) for curve in self.curves])
         covariance = np.asarray(np.linalg.inv(self._hessian), dtype=np.float64)
         made = []
+        flat = self._flat_noise()
         for index, curve in enumerate(self.curves):
             here = self._of_side[index]
             good = np.zeros(len(self._trust), dtype=bool)
@@ -399,6 +400,9 @@ class EdgeFit:
             freedom = max(lines - len(curve.coefficients), 1)
             excess = max(1.0, float(np.sum(off**2)) / freedom)
             block = slice(int(starts[index]), int(starts[index + 1]))
+            chi2, contrast = float(np.median(self._chi2[good])), float(np.median(self._contrast[good]))
+            # A profile that is off by a share of the step is as one moved by that over its steepest slope.
+            share = math.sqrt(max(chi2 - float(np.mean((flat / self._noise) ** 2)), 0.0)) / contrast
             made.append(
                 Side(
                     along_rows=curve.along_rows,
@@ -412,11 +416,19 @@ class EdgeFit:
                     density=(here.stop - here.start) / (2 * curve.half),
                     used=lines / (here.stop - here.start),
                     lines=lines,
-                    chi2=float(np.median(self._chi2[good])),
-                    contrast=float(np.median(self._contrast[good])),
+                    chi2=chi2,
+                    contrast=contrast,
+                    systematic_px=_SQRT_2PI * self.sigma * share,
                 )
             )
         return made[0], made[1], made[2], made[3]
+
+    def _flat_noise(self) -> FloatArray:
+        """Noise (3,) of a coded value from second differences along the lines, which a smooth misfit does not enter."""
+        light = self._lines.light
+        bent = np.abs(light[:-2] - 2 * light[1:-1] + light[2:]) / np.interp(light[1:-1], self._table, self._gain)
+        spread = [1.4826 * median_of(bent[:, channel].ravel()) / math.sqrt(6) for channel in range(3)]
+        return np.clip(spread, _QUANTISATION, self._noise)
 
     def strip_lines(self, index: int) -> StripLines:
         """The lines of pixels of one side, for the fit of a strip beside it."""

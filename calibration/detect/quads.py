@@ -28,7 +28,7 @@ _LEAST_LEFT, _LEAST_OUTLINE, _LEAST_OF_SIDE = 0.7, 0.6, 0.35
 _WHOLE_OUTLINE = 0.85
 _LEAST_HIDDEN_PERIMETER = 80.0
 """A smaller outline with a corner missing could be anything."""
-_MOST_LINES = 7
+_MOST_LINES = 6
 _HIDDEN_COUNTS = 0.2
 """How much a missing part of the outline counts beside a missing part of the area."""
 _GRID = 8
@@ -237,18 +237,20 @@ def _half_hidden(
     polygon = cv2.approxPolyDP(hull, 0.012 * perimeter, True).reshape(-1, 2).astype(np.float64)
     length = np.linalg.norm(np.roll(polygon, -1, axis=0) - polygon, axis=1)
     kept = [int(i) for i in np.argsort(-length)[:_MOST_LINES] if length[i] > 0.06 * perimeter]
+    if length[kept].sum() < _LEAST_OUTLINE * perimeter:
+        return None
     best: tuple[float, FloatArray] | None = None
     for four in itertools.combinations(sorted(kept), 4):
         starts = polygon[list(four)]
         ways = (polygon[(np.array(four) + 1) % len(polygon)] - starts) / length[list(four), None]
         corners = _crossings(starts, ways)
-        if corners is None:
+        if corners is None or not _LEAST_LEFT < area / _area(corners) < 1.05:
             continue
         corners = clockwise_from_top_left(corners)
-        if not _LEAST_LEFT < area / _area(corners) < 1.05 or tilt_cosine(corners, size_m) < _LEAST_TILT_COS:
-            continue
         outline = _outline_share(corners, points, perimeter)
-        if outline >= _LEAST_OUTLINE and (best is None or outline > best[0]):
+        if outline < _LEAST_OUTLINE or (best is not None and outline <= best[0]):
+            continue
+        if tilt_cosine(corners, size_m) >= _LEAST_TILT_COS:
             best = (outline, corners)
     if best is None:
         return None

@@ -9,7 +9,7 @@ import numpy as np
 from calibration.detect.aliasing import cut_variance
 from calibration.types import FloatArray
 
-SYSTEMATIC_PX, SYSTEMATIC_OF_BLUR = 0.006, 0.006
+SYSTEMATIC_PX, SYSTEMATIC_OF_BLUR = 0.006, 0.002
 """Standard deviation of what the Gaussian model leaves of a real side: of the pixel response, and, as a share of the
 blur's sigma, of a blur of another shape (a defocus disk) and of what lies behind within its reach."""
 

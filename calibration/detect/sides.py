@@ -15,10 +15,12 @@ from calibration.image import Transfer
 from calibration.types import FloatArray, Picture
 
 _ODD_CHI2, _ODD_MISFIT = 1.8, 0.015
-"""Median squared residual over the noise, and residual over the contrast, from which on a side is no plain edge: a
-strip is tried, and what is left of the misfit widens the side's place. In pictures with hardly any noise the shape of a
-real blur shows against the first, not against the second."""
+"""Median squared residual over the noise from which on a side may be no plain edge, so that a strip is tried; and
+residual over the contrast from which on what is left of it widens the side's place as far as it could have moved it. In
+pictures with hardly any noise the shape of a real blur shows against the first, not against the second."""
 _STRIP_ROOM_PX, _STRIP_LINES = 4.0, 80
+_STRIP_SYSTEMATIC_PX = 0.02
+"""What a strip between its two levels and one share leaves: a penumbra has another shape, light comes back into it."""
 _SIGMA_UNKNOWN, _SIGMA_KNOWN = 1.0, 0.1
 """Shares to which the blur is known before a side with a strip is fitted, and after."""
 
@@ -57,7 +59,7 @@ def fit_sides(
     sides = fit.sides()
     if sides is None:
         return None
-    odd = [index for index, side in enumerate(sides) if _is_odd(side.chi2, side.contrast)]
+    odd = [index for index, side in enumerate(sides) if side.chi2 > _ODD_CHI2]
     if not odd:
         return sides
     wide = EdgeFit(
@@ -79,8 +81,12 @@ def fit_sides(
         side, found = _with_strip(wide, index, sides[index], sigma, known)
         if found and known == _SIGMA_UNKNOWN:
             sigma, known = side.sigma_px, _SIGMA_KNOWN
-        if found or known == _SIGMA_KNOWN or index in odd:
+        if found or known == _SIGMA_KNOWN:
             made[index] = side
+        elif index in odd:
+            made[index] = replace(sides[index], systematic_px=side.systematic_px)
+        else:
+            break
     return made[0], made[1], made[2], made[3]
 
 
@@ -103,6 +109,9 @@ def _with_strip(wide: EdgeFit, index: int, plain: Side, sigma_px: float, sigma_k
     chi2 = float(np.median(fit.chi2[good])) if good.any() else plain.chi2
     typical = max(median_of(fit.information), 1e-12)
     freedom = float(np.median(3 * ((lines.weight[:, 0] > 0).sum(axis=0) - 2)))
+    systematic = _STRIP_SYSTEMATIC_PX if fit.width_px > 0 else plain.systematic_px
+    if _is_odd(chi2, plain.contrast):
+        systematic = _misfit_px(chi2, freedom, typical)
     side = replace(
         plain,
         middle=curve.middle,
@@ -115,7 +124,7 @@ def _with_strip(wide: EdgeFit, index: int, plain: Side, sigma_px: float, sigma_k
         chi2=chi2,
         line_variance_px2=max(chi2, 1.0) / typical,
         density=len(good) / (2 * curve.half),
-        systematic_px=_misfit_px(chi2, freedom, typical) if _is_odd(chi2, plain.contrast) else 0.0,
+        systematic_px=systematic,
     )
     return side, fit.width_px > 0
 

@@ -133,17 +133,13 @@ def fit_strip(lines: StripLines, coefficients: FloatArray, sigma_px: float, sigm
         cost, state = _descend(few, state, 6)
         if best is None or cost < best[0]:
             best = cost, state
-    state = plain if best is None else _descend(lines, best[1], 8)[1]
+    state = plain
+    if best is not None and _is_likelier(few, best[1], plain, len(lines.first) / len(few.first)):
+        state = _descend(lines, best[1], 8)[1]
+        if state.width[0] < _LEAST_WIDTH_PX or not _is_likelier(lines, state, plain, 1.0):
+            state = plain
     solved = _solve(lines, state, None)
-    freedom = max(float(solved.trust @ (3.0 * (solved.pixels - 2))) - len(coefficients) - 5, 1.0)
-    # Each line counts as much as it is trusted, in both fits alike.
-    left = _priced(solved, solved.trust, state, lines)
-    without = _solve(lines, plain, solved.trust)
-    gained = _priced(without, solved.trust, plain, lines) - left
-    threshold = _LEAST_GAIN * max(left / freedom, 1.0)
-    if gained < threshold or state.width[0] < _LEAST_WIDTH_PX:
-        state, solved = plain, _solve(lines, plain, None)
-    freedom = max(float(solved.trust @ (3.0 * (solved.pixels - 2))) - len(coefficients) - 5, 1.0)
+    freedom = _freedom(solved, len(coefficients))
     terms = len(coefficients)
     covariance = np.linalg.inv(solved.hessian)[:terms, :terms] * max(
         1.0, float(solved.trust @ solved.squares) / freedom
@@ -158,6 +154,20 @@ def fit_strip(lines: StripLines, coefficients: FloatArray, sigma_px: float, sigm
         solved.squares / np.maximum(3 * (solved.pixels - 2) - 1, 1),
         solved.information,
     )
+
+
+def _is_likelier(lines: StripLines, state: _State, plain: _State, more: float) -> bool:
+    """Whether a strip explains the pixels clearly better; ``more``: how many times as many lines there are in all."""
+    solved = _solve(lines, state, None)
+    # Each line counts as much as it is trusted, in both fits alike.
+    left = _priced(solved, solved.trust, state, lines)
+    without = _solve(lines, plain, solved.trust)
+    gained = _priced(without, solved.trust, plain, lines) - left
+    return more * gained > _LEAST_GAIN * max(left / _freedom(solved, len(state.coefficients)), 1.0)
+
+
+def _freedom(solved: _Solved, terms: int) -> float:
+    return max(float(solved.trust @ (3.0 * (solved.pixels - 2))) - terms - 5, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
