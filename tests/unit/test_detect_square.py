@@ -296,6 +296,15 @@ def test_half_hidden_corner_is_where_its_sides_cross(corner: int) -> None:
     assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(detection.covariance_px2), error)) / 2 < 3
 
 
+@pytest.mark.parametrize("corners", [3, 5, 6, 7, 8])
+def test_other_polygons_are_no_hidden_squares(corners: int) -> None:
+    for radius in (70, 110):
+        scene = Scene(480, 360)
+        angle = 0.1 + np.arange(corners) * 2 * math.pi / corners
+        scene.fill(np.column_stack([240 + radius * np.cos(angle), 180 + radius * np.sin(angle)]), RED)
+        assert isinstance(find_square(scene.picture(), SQUARE), Refusal)
+
+
 @pytest.mark.parametrize("radius", [140, 175])
 def test_what_hides_too_much_is_refused(radius: int) -> None:
     scene = Scene(480, 360)
