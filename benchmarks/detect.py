@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from benchmarks import detect_boards
+from benchmarks import detect_boards, detect_squares
 
-PARTS = (detect_boards.run,)
+PARTS = (detect_boards.run, detect_squares.run)
 PLOTS = (
     ("rmse_px", "error per coordinate, px"),
     ("vs_crb", "error over what the covariance says"),

@@ -127,7 +127,7 @@ def draw_board(
     picture = np.clip(np.rint(coded), 0, 255).astype(np.uint8)
     inner = np.array(
         [(column, row) for row in range(1, squares[1]) for column in range(1, squares[0])], dtype=np.float64
-    )
+    ).reshape(-1, 2)
     return BoardPicture(picture, project(view, inner), squares)
 
 

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from calibration.detect.aliasing import LEAST_SHARE, UNIFORM_VARIANCE_PX2, unsmoothed_share
-from calibration.detect.side import Curve, Side, meeting, start_curves
+from calibration.detect.side import Curve, Side
+from calibration.detect.strip import StripLines
 from calibration.image import Transfer, light_table
 from calibration.types import FloatArray, Picture
 
@@ -37,10 +38,13 @@ _LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.25, 40.0
 # A side shorter than 24 px is bent by less than 0.01 px where the picture's edge is bent by 5 %; the third order
 # needs 60 px to show as much. (Lengths at which the order rises to 2 and to 4.)
 _QUADRATIC_FROM_PX, _QUARTIC_FROM_PX = 24.0, 60.0
-_MOST_TERMS = 5
+MOST_TERMS = 5
 # Lines of pixels per side: more would not be seen in the result, which is bound by the model; blurred sides have
 # long lines, so that the number of pixels is bounded too.
-_MOST_LINES, _LEAST_LINES, _MOST_PIXELS = 400, 200, 4400
+MOST_LINES, LEAST_LINES, MOST_PIXELS = 400, 200, 4400
+_OTHER_COLOUR = 0.2
+"""Distance of a line's inside from the side's colour, both as shares of their light, from which on it is not trusted:
+something else is in front. A shadow changes the colour less."""
 _PRIOR_SIGMA_PX, _PRIOR_LOG_SPREAD = 0.5, 1.0
 """Weak prior of the blur (log-normal): decides only where all lines cut a sharp edge at the same place of a pixel."""
 
@@ -60,53 +64,11 @@ class _Lines:
     weight: FloatArray  # (m, 3, n) inverse variance, 0 outside the picture
 
 
-def fit_sides(
-    picture: Picture, corners: FloatArray, *, transfer: Transfer, uncertainty_px: float
-) -> tuple[Side, Side, Side, Side] | None:
-    """Fit the four sides (top, right, bottom, left) of a quadrilateral.
-
-    ``corners`` (4, 2): rough corners in px, clockwise from the top left; ``uncertainty_px``: how far off they may be.
-    None where a side has too few lines of pixels with contrast.
-    """
-    curves = start_curves(corners)
-    lengths = [2 * curve.half for curve in curves]
-    room = 0.45 * min(lengths)
-    reach = min(max(4.0, uncertainty_px + 3.0), room)
-    sigma = max(0.6, reach / 3)
-    margin = uncertainty_px
-    fit = _straight(picture, curves, transfer, reach, margin, sigma)
-    for _ in range(2):
-        wanted = min(3.2 * fit.sigma * 1.2 + 2.0, room)
-        if wanted <= reach * 1.05:
-            break
-        # More blurred than thought: the first look may have seen only the middle of the slope.
-        reach, sigma = wanted, fit.sigma
-        fit = _straight(picture, curves, transfer, reach, margin, sigma)
-    sigma = fit.sigma
-    margin = min(1.5 * sigma + 0.5, 0.25 * min(lengths))
-    for most_lines, tolerance_px, least_steps in ((60, 0.01, 2), (_MOST_LINES, 5e-4, 3)):
-        curves = meeting(fit.curves)
-        reach = min(3.2 * fit.sigma * 1.2 + 2.0, room)
-        most_lines = min(most_lines, max(_LEAST_LINES, int(_MOST_PIXELS / (2 * reach + 1))))
-        fit = _Fit(picture, curves, transfer, reach, margin, fit.sigma, order=_MOST_TERMS - 1, most_lines=most_lines)
-        fit.run(10, tolerance_px, least_steps=least_steps)
-    return fit.sides()
-
-
-def _straight(
-    picture: Picture, curves: list[Curve], transfer: Transfer, reach_px: float, margin_px: float, sigma_px: float
-) -> _Fit:
-    """A first fit of straight sides on few lines of pixels."""
-    fit = _Fit(picture, curves, transfer, reach_px, margin_px, sigma_px, order=1, most_lines=40)
-    fit.run(10, 0.05, least_steps=2)
-    return fit
-
-
 def _order_for(length_px: float, most: int) -> int:
     return min(1 + int(length_px >= _QUADRATIC_FROM_PX) + 2 * int(length_px >= _QUARTIC_FROM_PX), most)
 
 
-def _median(values: FloatArray) -> float:
+def median_of(values: FloatArray) -> float:
     """The (upper) median: numpy's own costs ten times as much on short arrays."""
     middle = values.size // 2
     return float(np.partition(values, middle)[middle])
@@ -127,7 +89,7 @@ class _Levels:
         return (y0 - rise * self._s1) * self._inverse_s0, rise
 
 
-class _Fit:
+class EdgeFit:
     """Gauss-Newton over the four sides and their common blur, on one set of lines of pixels."""
 
     def __init__(
@@ -162,6 +124,7 @@ class _Fit:
         bounds = np.searchsorted(self._lines.side, np.arange(5))
         self._of_side = [slice(int(bounds[index]), int(bounds[index + 1])) for index in range(4)]
         self._trust = np.ones(n)
+        self._alike = np.ones(n)
         self._chi2 = np.ones(n)
         self._information = np.zeros(n)
         self._contrast = np.zeros(n)
@@ -184,7 +147,7 @@ class _Fit:
             if len(x) > most_lines:
                 x = x[np.linspace(0, len(x) - 1, most_lines).astype(int)]
             places = x.astype(np.float64)
-            basis = np.zeros((len(x), _MOST_TERMS))
+            basis = np.zeros((len(x), MOST_TERMS))
             basis[:, : len(curve.coefficients)] = curve.basis(places)
             first = np.rint(basis[:, : len(curve.coefficients)] @ curve.coefficients) - count // 2
             y = first.astype(np.int64)[:, None] + across
@@ -226,11 +189,11 @@ class _Fit:
             share *= ndtr(self._inward(other) * away * cosine / self.sigma).reshape(y.shape)
         return share
 
-    def run(self, most_steps: int, tolerance_px: float, *, least_steps: int) -> None:
-        """Iterate until the curves move by less than the tolerance; the weights follow the residuals of two steps."""
+    def run(self, most_steps: int, tolerance_px: float) -> None:
+        """Iterate until the curves move by less than the tolerance, with weights that have settled."""
         for step in range(most_steps):
-            moved = self._step(reweigh=step < 2)
-            if moved < tolerance_px and step >= least_steps - 1:
+            moved = self._step(reweigh=step in (0, 2))
+            if moved < tolerance_px and step >= 3:
                 break
 
     def _step(self, *, reweigh: bool) -> float:
@@ -278,7 +241,7 @@ class _Fit:
         return self._solve(wanted, place_place, place_blur, blur_blur, wanted * place_place, pull_blur)
 
     def _centres(self) -> FloatArray:
-        table = np.zeros((4, _MOST_TERMS))
+        table = np.zeros((4, MOST_TERMS))
         for index, curve in enumerate(self.curves):
             table[index, : len(curve.coefficients)] = curve.coefficients
         return np.asarray(np.sum(self._lines.basis * table[self._lines.side], axis=1))
@@ -291,6 +254,7 @@ class _Fit:
         base, rise = levels.solve((lines.weight * lines.light).sum(axis=0), (weighted * lines.light).sum(axis=0))
         model = base + rise * shape
         gain = np.interp(model, self._table, self._gain)
+        self._alike = self._alike_inside(base + rise)
         trusted = self._trust > 0.5
         if np.count_nonzero(trusted) > 8:
             coded = np.abs((lines.light - model)[:, :, trusted]) / gain[:, :, trusted]
@@ -298,12 +262,24 @@ class _Fit:
             pixels = float(mask.sum(axis=0).mean())
             freed = math.sqrt(pixels / max(pixels - 2.3, 1.0))
             for channel in range(3):
-                spread = 1.4826 * _median(coded[:, channel][mask]) * freed
+                spread = 1.4826 * median_of(coded[:, channel][mask]) * freed
                 self._noise[channel] = max(spread, _QUANTISATION)
         lines.weight = lines.seen / (gain * self._noise[:, None]) ** 2
         self._aliased = self._aliased_share(
             ((lines.light - base) * rise).sum(axis=1), (rise * rise).sum(axis=0), off_px
         )
+
+    def _alike_inside(self, inside: FloatArray) -> FloatArray:
+        """Weight (n,) 0..1 of each line by the colour of its inside (3, n), beside the median of its side."""
+        light = np.maximum(inside, 0.0)
+        colour = light / np.maximum(light.sum(axis=0), 1e-6)
+        alike = np.ones(inside.shape[1])
+        for here in self._of_side:
+            if here.stop > here.start:
+                apart = np.abs(colour[:, here] - np.median(colour[:, here], axis=1)[:, None]).max(axis=0)
+                limit = max(_OTHER_COLOUR, 6 * median_of(apart))
+                alike[here] = 1 / (1 + (apart / limit) ** 8)
+        return alike
 
     def _aliased_share(self, products: FloatArray, squares: FloatArray, off_px: FloatArray) -> float:
         """Share of the error of edges cut to whole pixels (see ``aliasing``): from the pixels within half of one.
@@ -384,7 +360,7 @@ class _Fit:
         middle = abs(curve.middle - (along - 1) / 2)
         distance = abs(float(curve.coefficients[0]) - (across - 1) / 2)
         terms = len(curve.coefficients)
-        sigma = np.full(_MOST_TERMS, np.inf)
+        sigma = np.full(MOST_TERMS, np.inf)
         if terms > 2:
             sagitta = abs(float(curve.coefficients[2]))
             short = (2 * curve.half / width) ** 2
@@ -401,17 +377,18 @@ class _Fit:
                 continue
             off = off_px[here] * np.sqrt(information[here])
             if not settled:
-                off = off - _median(off)
-            spread = max(1.4826 * _median(np.abs(off)), 0.5)
-            worse = self._chi2[here] / max(_median(self._chi2[here]), 0.3)
+                off = off - median_of(off)
+            spread = max(1.4826 * median_of(np.abs(off)), 0.5)
+            worse = self._chi2[here] / max(median_of(self._chi2[here]), 0.3)
             trust[here] = 1 / (1 + (off / (3 * spread)) ** 4) / (1 + (worse / 6) ** 2)
-        return trust
+        return trust * self._alike
 
     def sides(self) -> tuple[Side, Side, Side, Side] | None:
         """What the fit found, or None where a side rests on too few lines."""
         starts = np.cumsum([0] + [len(curve.coefficients) for curve in self.curves])
         covariance = np.asarray(np.linalg.inv(self._hessian), dtype=np.float64)
         made = []
+        flat = self._flat_noise()
         for index, curve in enumerate(self.curves):
             here = self._of_side[index]
             good = np.zeros(len(self._trust), dtype=bool)
@@ -423,6 +400,9 @@ class _Fit:
             freedom = max(lines - len(curve.coefficients), 1)
             excess = max(1.0, float(np.sum(off**2)) / freedom)
             block = slice(int(starts[index]), int(starts[index + 1]))
+            chi2, contrast = float(np.median(self._chi2[good])), float(np.median(self._contrast[good]))
+            # A profile that is off by a share of the step is as one moved by that over its steepest slope.
+            share = math.sqrt(max(chi2 - float(np.mean((flat / self._noise) ** 2)), 0.0)) / contrast
             made.append(
                 Side(
                     along_rows=curve.along_rows,
@@ -432,12 +412,40 @@ class _Fit:
                     covariance=covariance[block, block] * excess,
                     sigma_px=self.sigma,
                     aliased=self._aliased,
-                    line_variance_px2=excess / max(_median(self._information[good]), 1e-12),
+                    line_variance_px2=excess / max(median_of(self._information[good]), 1e-12),
                     density=(here.stop - here.start) / (2 * curve.half),
                     used=lines / (here.stop - here.start),
                     lines=lines,
-                    chi2=float(np.median(self._chi2[good])),
-                    contrast=float(np.median(self._contrast[good])),
+                    chi2=chi2,
+                    contrast=contrast,
+                    systematic_px=_SQRT_2PI * self.sigma * share,
                 )
             )
         return made[0], made[1], made[2], made[3]
+
+    def _flat_noise(self) -> FloatArray:
+        """Noise (3,) of a coded value from second differences along the lines, which a smooth misfit does not enter."""
+        light = self._lines.light
+        bent = np.abs(light[:-2] - 2 * light[1:-1] + light[2:]) / np.interp(light[1:-1], self._table, self._gain)
+        spread = [1.4826 * median_of(bent[:, channel].ravel()) / math.sqrt(6) for channel in range(3)]
+        return np.clip(spread, _QUANTISATION, self._noise)
+
+    def strip_lines(self, index: int) -> StripLines:
+        """The lines of pixels of one side, for the fit of a strip beside it."""
+        here, lines, curve = self._of_side[index], self._lines, self.curves[index]
+        return StripLines(
+            lines.light[..., here],
+            lines.weight[..., here],
+            lines.neighbours[..., here],
+            lines.first[here],
+            lines.stretch[here],
+            lines.basis[here, 1],
+            lines.basis[here, : len(curve.coefficients)],
+            float(lines.sign[here][0]),
+            self._bend_information(curve),
+            self._alike[here],
+        )
+
+    def contrast_of(self, index: int) -> FloatArray:
+        """Contrast over the noise of a pixel of each line of a side, (n,)."""
+        return self._contrast[self._of_side[index]]

@@ -5,6 +5,7 @@ Works on a reduced picture; the corners are good to a pixel or two and only star
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -24,6 +25,14 @@ _LEAST_TILT_COS = 0.5
 _LEAST_FILL = 0.88
 _MOST_OF_ONE_COLOUR = 0.1
 """Largest difference of purity, as a share, within one paint under one lamp."""
+# What a thing in front may hide: of the whole, and of each side.
+_LEAST_LEFT, _LEAST_OUTLINE, _LEAST_OF_SIDE = 0.7, 0.6, 0.35
+_WHOLE_OUTLINE = 0.85
+_LEAST_HIDDEN_PERIMETER = 80.0
+"""A smaller outline with a corner missing could be anything."""
+_MOST_LINES = 6
+_HIDDEN_COUNTS = 0.2
+"""How much a missing part of the outline counts beside a missing part of the area."""
 _GRID = 8
 _MOST_SAMPLES = 1500
 _NEXT = np.array([1, 2, 3, 0])
@@ -204,12 +213,17 @@ def _shape_of(
     # A contour runs through the centres of the outermost pixels, half a pixel inside the region.
     perimeter = cv2.arcLength(hull, True)
     area = cv2.contourArea(contour) + cv2.arcLength(contour, True) / 2
-    if area < _LEAST_FILL * (cv2.contourArea(hull) + perimeter / 2):
-        return None
-    rough = _rough_corners(hull, perimeter)
+    share = area / (cv2.contourArea(hull) + perimeter / 2)
+    cut = any(touched)
+    rough = _rough_corners(hull, perimeter) if share >= _LEAST_FILL else None
+    if not cut and share >= _LEAST_LEFT and perimeter >= _LEAST_HIDDEN_PERIMETER:
+        points = contour.reshape(-1, 2)
+        if rough is None or _outline_share(rough, points, perimeter) < _WHOLE_OUTLINE:
+            hidden = _half_hidden(hull, points, perimeter, area, size_m)
+            if hidden is not None:
+                return hidden
     if rough is None:
         return None
-    cut = any(touched)
     tilt_cos = _cut_tilt(touched, (wide, tall), size_m) if cut else tilt_cosine(rough, size_m)
     if tilt_cos < _LEAST_TILT_COS - 0.1:
         return None
@@ -227,6 +241,79 @@ def _shape_of(
         return None
     centre = corners.mean(axis=0)
     return _Shape(corners, (float(centre[0]), float(centre[1])), fill, tilt_cos, math.sqrt(full), cut)
+
+
+def _half_hidden(
+    hull: NDArray[np.int32],
+    points: NDArray[np.int32],
+    perimeter: float,
+    area: float,
+    size_m: tuple[float, float],
+) -> _Shape | None:
+    """A quadrilateral of which something in front hides a part: the four straight pieces of its outline that hold
+    the most of it, each prolonged to its neighbours. What is hidden is only missing: nothing may stand outside.
+    """
+    polygon = cv2.approxPolyDP(hull, 0.012 * perimeter, True).reshape(-1, 2).astype(np.float64)
+    length = np.linalg.norm(np.roll(polygon, -1, axis=0) - polygon, axis=1)
+    kept = [int(i) for i in np.argsort(-length)[:_MOST_LINES] if length[i] > 0.06 * perimeter]
+    if length[kept].sum() < _LEAST_OUTLINE * perimeter:
+        return None
+    best: tuple[float, FloatArray] | None = None
+    for four in itertools.combinations(sorted(kept), 4):
+        starts = polygon[list(four)]
+        ways = (polygon[(np.array(four) + 1) % len(polygon)] - starts) / length[list(four), None]
+        corners = _crossings(starts, ways)
+        if corners is None or not _LEAST_LEFT < area / _area(corners) < 1.05:
+            continue
+        corners = clockwise_from_top_left(corners)
+        outline = _outline_share(corners, points, perimeter)
+        if outline < _LEAST_OUTLINE or (best is not None and outline <= best[0]):
+            continue
+        if tilt_cosine(corners, size_m) >= _LEAST_TILT_COS:
+            best = (outline, corners)
+    if best is None:
+        return None
+    fitted = _fitted_corners(best[1], points, hidden=True)
+    if fitted is None:
+        return None
+    tilt_cos = tilt_cosine(fitted, size_m)
+    full = _area(fitted)
+    outline = _outline_share(fitted, points, perimeter)
+    if outline < _LEAST_OUTLINE or tilt_cos < _LEAST_TILT_COS or not _LEAST_LEFT < area / full < 1.05:
+        return None
+    centre = fitted.mean(axis=0)
+    fill = 1 - _HIDDEN_COUNTS * (1 - outline)
+    return _Shape(fitted, (float(centre[0]), float(centre[1])), fill, tilt_cos, math.sqrt(full), False)
+
+
+def _crossings(starts: FloatArray, ways: FloatArray) -> FloatArray | None:
+    """Where each of four lines (4, 2) crosses the one before it; None where two are nearly parallel."""
+    before, before_way = starts[_BEFORE], ways[_BEFORE]
+    cross = before_way[:, 0] * ways[:, 1] - before_way[:, 1] * ways[:, 0]
+    if np.any(np.abs(cross) < 0.2):
+        return None
+    apart = starts - before
+    step = (apart[:, 0] * ways[:, 1] - apart[:, 1] * ways[:, 0]) / cross
+    return np.asarray(before + before_way * step[:, None], dtype=np.float64)
+
+
+def _outline_share(corners: FloatArray, points: NDArray[np.int32], perimeter: float) -> float:
+    """Share (0..1) of a quadrilateral's outline on which a contour's points (N, 2) lie; 0 if a side has too few."""
+    thin = max(1, len(points) // 400)
+    sample = points[::thin].astype(np.float64)
+    along = corners[_NEXT] - corners
+    length = np.hypot(along[:, 0], along[:, 1])
+    # A contour has a point for each step along the longer of the two directions.
+    expected = np.maximum(np.abs(along).max(axis=1) / thin, 1.0)
+    along = along / np.maximum(length, 1e-9)[:, None]
+    place = sample @ along.T - np.sum(corners * along, axis=1)
+    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    off = np.abs(sample @ outward.T - np.sum(corners * outward, axis=1))
+    on = (off < 1.3 + 0.003 * perimeter) & (place > -1) & (place < length + 1)
+    count = np.minimum(on.sum(axis=0), expected)
+    if np.any(count < _LEAST_OF_SIDE * expected):
+        return 0.0
+    return float(count.sum() / expected.sum())
 
 
 def _with_colour(shape: _Shape, field: ColourField) -> Quad | None:
@@ -256,8 +343,11 @@ def _rough_corners(hull: NDArray[np.int32], perimeter: float) -> FloatArray | No
     return None
 
 
-def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32]) -> FloatArray | None:
-    """Corners (4, 2), clockwise: crossings of lines through the contour's points between the rough corners."""
+def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32], *, hidden: bool = False) -> FloatArray | None:
+    """Corners (4, 2), clockwise: crossings of lines through the contour's points between the rough corners.
+
+    ``hidden``: points off a first line are left out, as they may be the outline of what is in front.
+    """
     along = rough[_NEXT] - rough
     length = np.hypot(along[:, 0], along[:, 1])
     if length.min() < LEAST_SIDE - 2:
@@ -267,26 +357,30 @@ def _fitted_corners(rough: FloatArray, contour: NDArray[np.int32]) -> FloatArray
     points = contour[:: max(1, len(contour) // 200)].astype(np.float64)
     place = points @ along.T - np.sum(rough * along, axis=1)  # (N, 4): along each side
     off = points @ outward.T - np.sum(rough * outward, axis=1)
-    near = ((np.abs(off) < np.maximum(2.0, 0.06 * length)) & (np.abs(place - length / 2) < 0.4 * length)).astype(float)
-    count = near.sum(axis=0)
-    if count.min() < 3:
+    reach = np.maximum(2.0, (0.02 if hidden else 0.06) * length)
+    near = ((np.abs(off) < reach) & (np.abs(place - length / 2) < 0.4 * length)).astype(float)
+    mean_place, mean_off, slope, rms = _lines_through(near, place, off)
+    if hidden:
+        apart = np.abs(off - mean_off - slope * (place - mean_place))
+        near *= apart < np.maximum(1.0, 1.5 * rms)
+        mean_place, mean_off, slope, rms = _lines_through(near, place, off)
+    if near.sum(axis=0).min() < 3 or np.any(rms > np.maximum(0.7, 0.025 * length)):
         return None
+    # A contour runs through the centres of the outermost pixels, half a pixel inside the region.
+    start = rough + along * mean_place[:, None] + outward * (mean_off + 0.5)[:, None]
+    return _crossings(start, along + outward * slope[:, None])
+
+
+def _lines_through(
+    near: FloatArray, place: FloatArray, off: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Lines through the points (N, 4) with weight ``near``: mean place and offset, slope and RMS, (4,) each."""
+    count = np.maximum(near.sum(axis=0), 1.0)
     mean_place, mean_off = (near * place).sum(axis=0) / count, (near * off).sum(axis=0) / count
     from_place, from_off = near * (place - mean_place), near * (off - mean_off)
     slope = (from_place * from_off).sum(axis=0) / np.maximum((from_place**2).sum(axis=0), 1e-9)
     rms = np.sqrt(((from_off - slope * from_place) ** 2).sum(axis=0) / count)
-    if np.any(rms > np.maximum(0.7, 0.025 * length)):
-        return None
-    # A contour runs through the centres of the outermost pixels, half a pixel inside the region.
-    start = rough + along * mean_place[:, None] + outward * (mean_off + 0.5)[:, None]
-    direction = along + outward * slope[:, None]
-    before, before_direction = start[_BEFORE], direction[_BEFORE]
-    cross = before_direction[:, 0] * direction[:, 1] - before_direction[:, 1] * direction[:, 0]
-    if np.any(np.abs(cross) < 0.2):
-        return None
-    apart = start - before
-    step = (apart[:, 0] * direction[:, 1] - apart[:, 1] * direction[:, 0]) / cross
-    return np.asarray(before + before_direction * step[:, None], dtype=np.float64)
+    return mean_place, mean_off, slope, rms
 
 
 def _inside(corners: FloatArray, field: ColourField) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 from calibration.detect.aliasing import cut_variance
 from calibration.types import FloatArray
 
-SYSTEMATIC_PX, SYSTEMATIC_OF_BLUR = 0.006, 0.006
+SYSTEMATIC_PX, SYSTEMATIC_OF_BLUR = 0.006, 0.002
 """Standard deviation of what the Gaussian model leaves of a real side: of the pixel response, and, as a share of the
 blur's sigma, of a blur of another shape (a defocus disk) and of what lies behind within its reach."""
 
@@ -22,7 +22,8 @@ class Side:
     ``covariance`` of the coefficients (px^2), without the systematic part. ``used``: share of the lines of pixels that
     fit; ``chi2``: their median squared residual over the noise; ``contrast``: median difference over the noise of
     one pixel; ``sigma_px``: blur normal to the side, pixel included. ``aliased``: share (0..1) of the error of edges
-    cut to whole pixels; ``line_variance_px2``: what one line of pixels tells; ``density``: lines used for each pixel.
+    cut to whole pixels; ``line_variance_px2``: what one line of pixels tells; ``density``: lines used for each pixel;
+    ``systematic_px``: how far a misfit common to its lines may have moved it.
     """
 
     along_rows: bool
@@ -38,6 +39,7 @@ class Side:
     aliased: float
     line_variance_px2: float
     density: float
+    systematic_px: float = 0.0
 
     def at(self, x: float) -> tuple[float, float, float]:
         """Value c(x), slope dc/dx and variance of c at a coordinate along the side (px, 1, px^2)."""
@@ -102,7 +104,10 @@ def corner_of(first: Side, second: Side, near: FloatArray) -> tuple[FloatArray, 
             rows.append([-slope, 1.0] if side.along_rows else [1.0, -slope])
             values.append(value - y)
             variance[index] = (
-                spread + side.aliasing(slope, spread) + (SYSTEMATIC_PX + SYSTEMATIC_OF_BLUR * side.sigma_px) ** 2
+                spread
+                + side.aliasing(slope, spread)
+                + (SYSTEMATIC_PX + SYSTEMATIC_OF_BLUR * side.sigma_px) ** 2
+                + side.systematic_px**2
             )
         jacobian = np.array(rows)
         if abs(np.linalg.det(jacobian)) < 0.1:

@@ -12,11 +12,11 @@ import math
 import cv2
 import numpy as np
 
-from calibration.detect.edge import fit_sides
 from calibration.detect.mask import KNOWN_COLOURS, colour_field
 from calibration.detect.prediction import Prediction
 from calibration.detect.quads import Quad, find_quads
 from calibration.detect.side import Side, corner_of
+from calibration.detect.sides import fit_sides
 from calibration.errors import InvalidInput
 from calibration.image import Transfer
 from calibration.types import (
@@ -37,8 +37,12 @@ _COARSE_WIDTH = 960
 _COARSE_MOST_FACTOR = 3
 # The best candidate must beat the next by this factor; two squares of one colour and nearly one size are a tie.
 _CLEARLY_BETTER = 1.35
+_MOST_READINGS = 2
+"""How many other outlines of the chosen thing are tried where its first one has no edges."""
 _LEAST_USED = 0.35
 _MOST_SIGMA_PX = 1.0
+"""A corner less certain than this is left out; fewer than three are no target."""
+_LEAST_CORNERS = 3
 _PIXEL_VARIANCE = 1.0 / 12.0
 _ROW_BY_ROW = (0, 1, 3, 2)
 """Clockwise corners (TL, TR, BR, BL) in the target's order (TL, TR, BL, BR)."""
@@ -57,7 +61,8 @@ def find_square(
     the target's order (top left, top right, bottom left, bottom right) with their sigma: only that part is searched.
 
     Returns corners in that order, upright reading (roll within 45 degrees), with covariance (px^2), the crossing of
-    the diagonals as centre, and the Gaussian sigma of the blur without the pixel's own. A refusal gives the reason:
+    the diagonals as centre (a corner that something hides is where its sides cross; too uncertain, it is left out),
+    and the Gaussian sigma of the blur without the pixel's own. A refusal gives the reason:
     not found, cut by the frame, too small, several equally good candidates, edges too weak. Raises
     :class:`InvalidInput` for a target of another kind or a picture of the wrong shape.
     """
@@ -71,7 +76,19 @@ def find_square(
     chosen = _search(picture, colour, target.size_m, transfer, near)
     if isinstance(chosen, Refusal):
         return chosen
-    corners, uncertainty_px = chosen
+    refused: Refusal | None = None
+    for corners, uncertainty_px in chosen:
+        result = _fitted(picture, corners, uncertainty_px, colour, transfer)
+        if isinstance(result, Detection):
+            return result
+        refused = refused or result
+    return refused or Refusal(f"no {colour} square was found")
+
+
+def _fitted(
+    picture: Picture, corners: FloatArray, uncertainty_px: float, colour: str, transfer: Transfer
+) -> DetectionResult:
+    """The square whose rough ``corners`` (4, 2), clockwise, are off by up to ``uncertainty_px``; or why not."""
     shortest = float(np.min(np.linalg.norm(corners[[1, 2, 3, 0]] - corners, axis=1)))
     if shortest < LEAST_SIDE_PX - 1:
         return Refusal(f"the {colour} square is too small: side {shortest:.0f} px, at least {LEAST_SIDE_PX:.0f} needed")
@@ -83,8 +100,11 @@ def find_square(
 
 def _search(
     picture: Picture, colour: str, size_m: tuple[float, float], transfer: Transfer, near: Prediction | None
-) -> tuple[FloatArray, float] | Refusal:
-    """Rough corners (4, 2) clockwise in px and how far off they may be; or why there are none."""
+) -> list[tuple[FloatArray, float]] | Refusal:
+    """Rough corners (4, 2) clockwise in px and how far off they may be, the likeliest first; or why there are none.
+
+    All of them are readings of one thing: a shadow on the target may part it at some levels.
+    """
     height, width = picture.shape[:2]
     window = (0, 0, width, height) if near is None else _window(near, width, height)
     if window is None:
@@ -107,7 +127,19 @@ def _search(
     found = _choose(quads, colour, scale, offset, narrowed=near is not None)
     if isinstance(found, Refusal):
         return found
-    return found.corners * scale + offset, 2.0 * float(scale.max()) + 0.02 * found.side * float(scale.mean())
+    same = [quad for quad in quads if quad is not found and not quad.cut and _overlap(quad, found)]
+    return [
+        (quad.corners * scale + offset, 2.0 * float(scale.max()) + 0.02 * quad.side * float(scale.mean()))
+        for quad in [found, *same[:_MOST_READINGS]]
+    ]
+
+
+def _overlap(one: Quad, other: Quad) -> bool:
+    """Whether the centre of one of two candidates lies in the other."""
+    pairs = ((one, other), (other, one))
+    return any(
+        cv2.pointPolygonTest(a.corners.astype(np.float32), b.corners.mean(axis=0).tolist(), False) > 0 for a, b in pairs
+    )
 
 
 def _window(near: Prediction, width: int, height: int) -> tuple[int, int, int, int] | None:
@@ -142,8 +174,9 @@ def _choose(quads: list[Quad], colour: str, scale: FloatArray, offset: FloatArra
             )
     if not whole:
         return Refusal(f"no {colour} square was found{where}")
-    if len(whole) > 1 and whole[0].score <= _CLEARLY_BETTER * whole[1].score and not narrowed:
-        a, b = (quad.corners.mean(axis=0) * scale + offset for quad in whole[:2])
+    rivals = [quad for quad in whole[1:] if not _overlap(quad, whole[0])]
+    if rivals and whole[0].score <= _CLEARLY_BETTER * rivals[0].score and not narrowed:
+        a, b = (quad.corners.mean(axis=0) * scale + offset for quad in (whole[0], rivals[0]))
         return Refusal(
             f"two {colour} squares are equally likely, near ({a[0]:.0f}, {a[1]:.0f}) and ({b[0]:.0f}, {b[1]:.0f}): "
             "cover one of them"
@@ -171,17 +204,18 @@ def _measured(
     if corners.min() < 0 or corners[:, 0].max() > width - 1 or corners[:, 1].max() > height - 1:
         return Refusal(f"the {colour} square is cut by the picture's frame")
     used = min(one.used for one in sides)
-    worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance))))
-    if used < _LEAST_USED or not math.isfinite(worst) or worst > _MOST_SIGMA_PX:
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
+    order = np.array([index for index in _ROW_BY_ROW if sigma[index] < _MOST_SIGMA_PX])
+    if used < _LEAST_USED or len(order) < _LEAST_CORNERS:
         return Refusal(
             f"the {colour} square's edges are too weak to be measured "
-            f"({used:.0%} of a side usable, corner sigma {worst:.2f} px)"
+            f"({used:.0%} of a side usable, corner sigma {np.max(sigma):.2f} px)"
         )
-    order = list(_ROW_BY_ROW)
+    worst = float(np.max(sigma[order]))
     return Detection(
         kind=TargetKind.SQUARE,
         points_px=corners[order],
-        point_ids=np.arange(4, dtype=np.int64),
+        point_ids=np.array([_ROW_BY_ROW.index(int(index)) for index in order], dtype=np.int64),
         covariance_px2=covariance[order],
         centre_px=_diagonal_crossing(corners),
         blur_px=math.sqrt(max(blur**2 - _PIXEL_VARIANCE, 0.0)),

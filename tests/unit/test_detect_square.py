@@ -66,14 +66,18 @@ class Scene:
 
     def fill(self, corners: Floats, colour: tuple[float, float, float], sigma_px: float = 0.5) -> Floats:
         """Paint a convex polygon given clockwise in the undistorted plane; returns its corners in the picture."""
+        self.light += self.share(corners, sigma_px)[..., None] * (np.array(colour) - self.light)
+        return self.distorted(corners)
+
+    def share(self, corners: Floats, sigma_px: float = 0.5) -> Floats:
+        """Share (H, W) of each pixel that a convex polygon covers."""
         share = np.ones(self.light.shape[:2])
         for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             along = (second - first) / np.linalg.norm(second - first)
             depth = (self.plane - first) @ np.array([-along[1], along[0]])
             down, across = np.gradient(depth)
             share *= ndtr(depth / np.hypot(across, down) / sigma_px)
-        self.light += share[..., None] * (np.array(colour) - self.light)
-        return self.distorted(corners)
+        return np.asarray(share)
 
     def disk(self, centre: tuple[float, float], radius: float, colour: tuple[float, float, float]) -> None:
         v, u = np.mgrid[: self.size[1], : self.size[0]]
@@ -284,6 +288,62 @@ def test_proportions_of_the_target_are_used() -> None:
     wide = scene.fill(square_at(440, 180, 180, 3, 0.5), RED)
     target = Target(TargetKind.SQUARE, size_m=(1.0, 0.5), colours=("red",))
     assert np.abs(off(found(find_square(scene.picture(), target)), wide)).max() < 0.05
+
+
+@pytest.mark.parametrize("corner", [0, 1, 2, 3])
+def test_half_hidden_corner_is_where_its_sides_cross(corner: int) -> None:
+    """A dark ball covers a corner: it is found all the same, and less certain than the others."""
+    scene = Scene(480, 360)
+    corners = scene.fill(square_at(240.3, 180.2, 170, 4), RED)
+    scene.disk((float(corners[corner, 0]) + 4, float(corners[corner, 1]) - 3), 38, (0.03, 0.03, 0.035))
+    detection = found(find_square(scene.picture(), SQUARE))
+    error = off(detection, corners)
+    assert detection.point_ids.tolist() == [0, 1, 2, 3]
+    assert np.abs(error).max() < 0.25
+    sigma = np.sqrt(np.trace(detection.covariance_px2, axis1=1, axis2=2))
+    hidden = ROW_BY_ROW.index(corner)
+    assert int(np.argmax(sigma)) == hidden
+    seen = np.delete(error, hidden, axis=0)
+    assert np.abs(seen).max() < 0.05
+    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(detection.covariance_px2), error)) / 2 < 3
+
+
+@pytest.mark.parametrize("corners", [3, 5, 6, 7, 8])
+def test_other_polygons_are_no_hidden_squares(corners: int) -> None:
+    for radius in (70, 110):
+        scene = Scene(480, 360)
+        angle = 0.1 + np.arange(corners) * 2 * math.pi / corners
+        scene.fill(np.column_stack([240 + radius * np.cos(angle), 180 + radius * np.sin(angle)]), RED)
+        assert isinstance(find_square(scene.picture(), SQUARE), Refusal)
+
+
+@pytest.mark.parametrize("radius", [140, 175])
+def test_what_hides_too_much_is_refused(radius: int) -> None:
+    scene = Scene(480, 360)
+    corners = scene.fill(square_at(240.3, 180.2, 170, 4), RED)
+    scene.disk((float(corners[1, 0]), float(corners[1, 1])), radius, (0.03, 0.03, 0.035))
+    assert isinstance(find_square(scene.picture(), SQUARE), Refusal)
+
+
+@pytest.mark.parametrize("width_px", [0.8, 1.6, 3.0])
+def test_shadow_beside_two_sides(width_px: float) -> None:
+    """A dark strip below and left of the square, on a bright panel: the sides are where the colour ends."""
+    errors, normalised = [], []
+    for seed in range(3):
+        scene = Scene(400, 320, background=(0.4, 0.4, 0.4))
+        place = np.array([200.0, 160.0]) + np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
+        target = square_at(place[0], place[1], 150, 5)
+        # Blurred as one picture: the shadow does not shine through the square's blurred edge.
+        red = scene.share(target)
+        shade = np.maximum(scene.share(target + [-0.7 * width_px, width_px]), red) - red
+        scene.light += shade[..., None] * (0.03 - scene.light) + red[..., None] * (np.array(RED) - scene.light)
+        corners = scene.distorted(target)
+        detection = found(find_square(scene.picture(2.0, seed), SQUARE))
+        error = off(detection, corners)
+        errors.append(error)
+        normalised.extend(np.einsum("ni,nij,nj->n", error, np.linalg.inv(detection.covariance_px2), error) / 2)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.05
+    assert np.mean(normalised) < 4
 
 
 def test_bad_input() -> None:
