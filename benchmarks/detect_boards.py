@@ -31,7 +31,7 @@ SQUARES = (11, 11)
 PREDICTION_SIGMA_PX = 4.0
 POSES = 3
 HARD = ("g8", "d16")
-HARD_POSES = 200
+HARD_POSES = 20
 """Pictures of the hardest cases, for ours alone: the others are done after the first ``POSES``."""
 _SLOW = ("findChessboardCorners + cornerSubPix", "findChessboardCornersSB", "findChessboardCornersSB ACCURACY")
 

@@ -290,7 +290,7 @@ def _open_sides(points_px: FloatArray, picture: Picture) -> tuple[int, int]:
 def _board(grid: Grid, picture: Picture, error_px: float, plane: Reduced) -> Board:
     points = grid.points
     there = np.isfinite(points[..., 0])
-    seen = there.any(axis=1)[:, None] & there.any(axis=0)[None, :]
+    seen = np.logical_and.outer(there.any(axis=1), there.any(axis=0))
     while not np.isfinite(points).all():
         expected = predict_missing(points)
         filled = np.where(np.isfinite(points), points, expected)
