@@ -138,11 +138,11 @@ def _row(name: str, method: str, counts: Sequence[_Count]) -> Row:
 def _beyond(engine: CornerEngine, camera: EngineCamera, asked: Lens, lens: Lens) -> float:
     """RMS per coordinate over the frame beyond the least that this engine can leave; the engine's settings are known
     here, for judging, and nowhere else."""
-    error, least = (_rms(engine.off_px(told, lens)) for told in (asked, _right(camera).asking_for(lens)))
+    error, least = (_rms(engine.off_px(told, lens)) for told in (asked, right_model(camera).asking_for(lens)))
     return math.sqrt(max(error**2 - least**2, 0.0)) if math.isfinite(error) else math.inf
 
 
-def _right(camera: EngineCamera) -> EngineModel:
+def right_model(camera: EngineCamera) -> EngineModel:
     """The model that describes the engine, worked out from its settings."""
     width, height = SIZE
     axis = height / width if camera.fov_axis.value == "y" else 1.0

@@ -44,13 +44,16 @@ async def run_job(settings: Settings, engines: Engines, request: JobRequest, sho
     async with running_service(settings, engines) as service:
         record = await service.runner.submit(request)
         interrupted = False
+        found: list[str] = []
         try:
-            await _follow(service, record.id, len(request.levels), show)
+            found = await _follow(service, record.id, len(request.levels), show)
         except asyncio.CancelledError:
             interrupted = True
             await service.runner.cancel(record.id)
             await _follow(service, record.id, len(request.levels), lambda share, doing: None)
         engine = next(info for info in engines.infos() if info.name == request.engine)
+        for line in found:
+            warn(line)
         if engine.dirty is not None:
             warn(_by_hand(engine, engine.dirty))
         record = await service.repository.get_job(record.id)
@@ -84,7 +87,9 @@ def _by_hand(engine: EngineInfo, reason: str) -> str:
     return f"the engine's values could not be put back: {reason}; set by hand what it had: {values}"
 
 
-async def _follow(service: Service, job_id: str, levels: int, show: Show) -> None:
+async def _follow(service: Service, job_id: str, levels: int, show: Show) -> list[str]:
+    """Show a job's progress to its end; what it found to be wrong with the studio's profile, one line each."""
+    found: list[str] = []
     seen, done, share, level = 0, 0, 0.0, ""
     with service.broker.listen(job_id) as wakeups:
         while True:
@@ -99,10 +104,14 @@ async def _follow(service: Service, job_id: str, levels: int, show: Show) -> Non
                     share = event["progress"]
                 elif kind in ("level_done", "level_failed"):
                     done, share = done + 1, 0.0
+                elif kind == "engine_learned":
+                    found += event["disagreements"]
+                    if not event["trusted"]:
+                        found.append(f"the engine's camera was not learned: {event['reason']}")
                 doing = f"level {min(done + 1, levels)}/{levels}: {level}" if level else "measuring the output's delay"
                 show((done + share) / levels, doing)
                 if kind in TERMINAL_KINDS:
-                    return
+                    return found
             await wakeups.wait(_LOOK_AGAIN_S)
 
 

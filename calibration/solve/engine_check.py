@@ -27,9 +27,15 @@ _SIGMAS = 4.0
 _BROYDEN_STEPS = 7
 _NEWTON_STEPS = 6
 _MOST_FAILURES = 3
-_SEARCH_VIEWS = 3
+_SEARCH_VIEWS, _ENOUGH_VIEWS = 3, 2
+_STARTS = ((1.0, 0.0), (0.3, 0.0), (0.0, 0.0), (0.0, 0.3))
+# Where a search begins: share of k1 and k2, log of how much wider.
 _STEPS = np.array([2e-3, 4e-3, 4e-3, 2.0, 2.0])
 # Finite differences: some px at the picture's edge, far above the corners' noise, far below the model's bends.
+_SHARES = (1.0, -1.0, 0.03, -0.03)
+# Of those steps: an engine with another unit of the radius may bend the target out of the picture.
+_GAIN = 0.9
+# A round that leaves more than this share has gained nothing.
 _LARGEST = np.array([0.15, 0.1, 0.1, 200.0, 200.0])
 
 
@@ -155,18 +161,19 @@ class EngineCheck:
     def _search(self) -> Program:
         """From the model's values to ones at which the engine's corners are where the lens puts them."""
         self._searched = "Broyden"
-        x = _vector(self._asked)
-        off = yield from self._look_where_found()
+        x, off = yield from self._started(_vector(self._asked))
         if off is None:
             self._seen = {}
             return
         jacobian = self._model_jacobian(x)
         x, off = yield from self._descend(x, off, jacobian, _BROYDEN_STEPS)
-        if not self._agrees(off) and self._room_for(len(_STEPS) + 1):
+        while not self._agrees(off) and self._room_for(len(_STEPS) + 1):
             self._searched = "finite differences"
+            before = rms(off)
             slopes = yield from self._slopes(x, off)
-            if slopes is not None:
-                x, off = yield from self._descend(x, off, slopes, _NEWTON_STEPS)
+            x, off = yield from self._descend(x, off, slopes, _NEWTON_STEPS)
+            if rms(off) > _GAIN * before:
+                break
         self._asked = self._lens_of(x)
         searched = {view.name for view in self._search_views}
         best = dict(self._seen)
@@ -186,18 +193,31 @@ class EngineCheck:
                 f"{self._renders} renders: its camera bends in a way that its k1 and k2 cannot follow"
             )
 
-    def _look_where_found(self) -> Generator[RenderWanted, DetectionResult, FloatArray | None]:
-        """As :meth:`_look` at the first values, with the poses left out at which the engine draws no target."""
-        parts: list[FloatArray] = []
-        seen: dict[str, Detection] = {}
-        for view in self._search_views:
-            off = yield from self._look(self._asked, [view], self._wanted_px)
-            if off is not None:
-                parts.append(off)
-                seen |= self._seen
-        self._seen = seen
-        self._search_views = [view for view in self._search_views if view.name in seen]
-        return np.concatenate(parts) if parts else None
+    def _started(
+        self, asked: FloatArray
+    ) -> Generator[RenderWanted, DetectionResult, tuple[FloatArray, FloatArray | None]]:
+        """Values to begin with, and how far the engine's corners are off there at the poses where the target is found.
+
+        Where the engine bends the target out of its picture: less of the bend, then a wider view as well. That with the
+        most poses is taken: values that suit one place alone may be far from any lens.
+        """
+        best_x, best_off, best_seen = asked, None, dict[str, Detection]()
+        for less_bent, wider in _STARTS:
+            x = asked * np.array([1.0, less_bent, less_bent, 1.0, 1.0]) - np.array([wider, 0.0, 0.0, 0.0, 0.0])
+            parts: list[FloatArray] = []
+            seen: dict[str, Detection] = {}
+            for view in self._search_views:
+                off = yield from self._look(self._lens_of(x), [view], self._wanted_px)
+                if off is not None:
+                    parts.append(off)
+                    seen |= self._seen
+            if len(seen) > len(best_seen):
+                best_x, best_off, best_seen = x, np.concatenate(parts), seen
+            if len(seen) >= min(_ENOUGH_VIEWS, len(self._search_views)):
+                break
+        self._seen = best_seen
+        self._search_views = [view for view in self._search_views if view.name in best_seen]
+        return best_x, best_off
 
     def _descend(
         self, x: FloatArray, off: FloatArray, jacobian: FloatArray, steps: int
@@ -222,18 +242,20 @@ class EngineCheck:
         self._seen = best
         return x, off
 
-    def _slopes(self, x: FloatArray, off: FloatArray) -> Generator[RenderWanted, DetectionResult, FloatArray | None]:
-        """Derivatives (M, 5) of the engine's corners by finite differences; None where a render cannot be measured."""
+    def _slopes(self, x: FloatArray, off: FloatArray) -> Generator[RenderWanted, DetectionResult, FloatArray]:
+        """Derivatives (M, 5) of the engine's corners by finite differences; 0 where no render can be measured."""
         best = dict(self._seen)
         columns: list[FloatArray] = []
         for index in range(len(_STEPS)):
-            step = np.zeros(len(_STEPS))
-            step[index] = _STEPS[index]
-            moved = yield from self._look(self._lens_of(x + step), self._search_views, self._wanted_px)
-            if moved is None or moved.shape != off.shape:
-                self._seen = best
-                return None
-            columns.append((moved - off) / _STEPS[index])
+            column = np.zeros(len(off))
+            for share in _SHARES:
+                step = np.zeros(len(_STEPS))
+                step[index] = share * _STEPS[index]
+                moved = yield from self._look(self._lens_of(x + step), self._search_views, self._wanted_px)
+                if moved is not None and moved.shape == off.shape:
+                    column = (moved - off) / step[index]
+                    break
+            columns.append(column)
         self._seen = best
         return np.column_stack(columns)
 
