@@ -6,8 +6,8 @@ Two edges cross at (x, y). With signed distances d1, d2 to the edges, and a blur
 
 F the blurred product of the edges' signs (see :mod:`calibration.detect.kernel`), rho the cosine between their normals.
 The box of a pixel is part of s (it adds 1/12 px^2 to the variance along any direction). An edge may be bent, as a
-straight line seen through a lens is: d is then d_line - curvature / 2 * (way along the edge)^2, the curvature known
-from the grid.
+straight line seen through a lens is: d is then d_line - curvature / 2 * ((way along the edge)^2 + s^2), the curvature
+known from the grid: blurred, a bent edge moves towards its centre of curvature.
 
 Free for each corner: x, y, two angles, ln s, o, g. Gauss-Newton with Levenberg's damping, weights from the noise at
 the model's light, so the inverse normal matrix is the Cramer-Rao bound and is returned as the covariance.
@@ -68,6 +68,7 @@ def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None,
     way = (cos * local[:, :1] + sin * local[:, 1:]).astype(np.float32)
     off = (cos * local[:, 1:] - sin * local[:, :1]).astype(np.float32)
     cosine, sine = cos.astype(np.float32), sin.astype(np.float32)
+    spread = (state.sigma_px**2).astype(np.float32)[:, None]
     ways: list[Pixels] = []
     distances: list[Pixels] = []
     for edge in (0, 1):
@@ -79,8 +80,11 @@ def corner_shape(windows: Windows, state: CornerState, curvature: Pixels | None,
         d -= sine[:, one] * windows.du
         d -= off[:, one]
         if curvature is not None:
-            bend = t * (0.5 * curvature[:, one])
+            # Blurred, a curved edge lies nearer to its centre of curvature: the mean of (t + a)^2 is t^2 + sigma^2.
+            half = 0.5 * curvature[:, one]
+            bend = t * half
             bend *= t
+            bend += half * spread
             d -= bend
         ways.append(t)
         distances.append(d)

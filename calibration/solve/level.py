@@ -162,7 +162,7 @@ def _first_fit(kept: list[View], known: _Known) -> Fit:
         thorough = fitted_from(True)
     except (NotConverged, NotEnoughData, np.linalg.LinAlgError):
         return quick
-    return min(quick, thorough, key=lambda fit: (fit.worst_view() is not None, fit.floor_px))
+    return thorough if thorough.floor_px < quick.floor_px else quick
 
 
 def _odd_one_out(kept: list[View], fitted: Fit) -> tuple[int, str] | None:

@@ -121,6 +121,15 @@ async def test_a_picture_of_a_level(client: httpx.AsyncClient, ledger: Repositor
     assert (again.status_code, again.content) == (304, b"")
 
 
+async def test_the_evidence_of_a_level(client: httpx.AsyncClient, ledger: Repository) -> None:
+    job = await stored_job(ledger, evidence='{"level_evidence":1}')
+    path = f"/api/v1/jobs/{job.id}/levels/0/0.0/evidence"
+    answer = await client.get(path)
+    assert (answer.status_code, answer.json()) == (200, {"level_evidence": 1})
+    again = await client.get(path, headers={"If-None-Match": answer.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
 async def test_only_pictures_are_shown_as_pictures(client: httpx.AsyncClient, ledger: Repository) -> None:
     path = f"/api/v1/jobs/{(await stored_job(ledger)).id}/levels/0/0/picture"
     answer = await client.get(path, params={"kind": "real"})

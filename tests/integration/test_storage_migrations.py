@@ -176,3 +176,27 @@ async def test_a_database_of_the_first_release_gets_a_place_for_evidence(path: P
         with pytest.raises(NotFound, match="evidence of level zoom 1"):
             await repository.get_evidence(job.id, 1.0, 0.5)
     assert backups(path) == ["lensmatch.backup-0001-20261121T100000Z.db"]
+
+
+async def test_killed_half_way_the_first_release_is_still_there_and_is_then_upgraded(
+    path: Path, tmp_path: Path, repository: Path
+) -> None:
+    before = await Database.open(path, now, first_schema(tmp_path))
+    await before.close()
+    deadly = tmp_path / "deadly"
+    shutil.copytree(MIGRATIONS, deadly, ignore=shutil.ignore_patterns("__pycache__"))
+    step = deadly / "versions" / "r0002_evidence.py"
+    step.write_text(step.read_text("utf-8") + "    __import__('os')._exit(9)\n", "utf-8")
+    script = (
+        "import asyncio, sys; from datetime import UTC, datetime; from pathlib import Path; "
+        "from storage.database import Database; "
+        "asyncio.run(Database.open(sys.argv[1], lambda: datetime.now(UTC), Path(sys.argv[2])))"
+    )
+    command = [sys.executable, "-c", script, str(path), str(deadly)]
+    killed = await asyncio.to_thread(subprocess.run, command, cwd=repository, check=False, timeout=60)
+    assert killed.returncode == 9
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
+    assert rows(path, "SELECT name FROM sqlite_master WHERE name = 'evidence'") == []
+    async with await Repository.open(path, now) as ledger:
+        await ledger.check()
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]

@@ -78,12 +78,12 @@ def lens_table(lens: str = "XA 20x") -> LensTable:
     )
 
 
-async def stored_job(ledger: Repository) -> JobRecord:
+async def stored_job(ledger: Repository, *, evidence: str | None = None) -> JobRecord:
     """A job with one level done, one failed, a picture and its table."""
     job = await ledger.create_job(JOB, "XA 20x", "default")
     running = draft(JobStarted(engine="default", levels=2))
     await ledger.set_job_state(job.id, JobState.RUNNING, expected=[JobState.QUEUED], event=running)
-    await ledger.save_level(job.id, 0, measured_level(), draft(LevelDone.of(0, measured_level())))
+    await ledger.save_level(job.id, 0, measured_level(), draft(LevelDone.of(0, measured_level())), evidence=evidence)
     await ledger.save_level(job.id, 1, LevelResult.failed(1.0, 0.5, "no board"), ("level_failed", {}))
     await ledger.save_picture(job.id, 0, PictureKind.OVERLAY, "image/jpeg", JPEG)
     await ledger.save_picture(job.id, 0, PictureKind.REAL, "image/svg+xml", b"<svg onload='alert(1)'/>")

@@ -20,12 +20,15 @@ from app.report.numbers import digits_for, encoder, number, pixels
 from app.report.page import verdict
 from calibration.compare import overlay
 from calibration.lens import Lens
+from calibration.solve.evidence import LevelInputs, level_evidence
 from calibration.solve.level import held_out_residuals, solve_level
+from calibration.solve.mistakes import Mistake
 from calibration.solve.outcome import level_result
 from calibration.solve.problem import View
 from calibration.synthetic import observe
-from calibration.tables import LeftOut, LensTable, LevelResult, LevelStatus, PixelError, Sigma
+from calibration.tables import LeftOut, LensTable, LevelResult, LevelStatus, Parallax, PixelError, Sigma
 from calibration.types import CameraPose, Detection, Target, TargetKind, TargetPose
+from storage.evidence import evidence_to_document, summary_of
 from storage.records import PictureKind
 
 SIZE = (1920, 1080)
@@ -283,6 +286,35 @@ def test_picture_set_report_shows_each_picture_of_the_fit() -> None:
     assert len(checker.sources) == 2  # residual arrows and the map of expected overlay error
     for name in ("a.png", "b.png", "c.png"):
         assert f"{name} board 49 of 49" in words(page)
+
+
+def test_the_evidence_says_what_the_pictures_show_first() -> None:
+    mistakes = (
+        Mistake("height", "board", "mm", 0.1, 0.9, 3.0),
+        Mistake("place in depth", "board", "mm", 3.1, 0.4, 3.0),
+        Mistake("pan scale", "", "", 0.0001, 0.0019, 0.002),
+    )
+    target = Target(TargetKind.CHESSBOARD, squares=(8, 8), square_m=0.2, pose=TargetPose((0.0, 6.0, 1.5)))
+    rng = np.random.default_rng(12)
+    views = []
+    for name, pan, tilt in (("a.png", -14.0, 0.0), ("b.png", 12.0, 6.0), ("c.png", 3.0, -7.0)):
+        pose = CameraPose((0.0, 0.0, 1.5), pan, tilt)
+        seen = observe(Lens.from_fov(SIZE, 56.0, -0.12, 0.03), pose, target, rng)
+        assert isinstance(seen, Detection)
+        views.append(View(name, "board", target, seen, pose))
+    fit = replace(solve_level(views, SIZE), mistakes=mistakes, parallax=Parallax(2.2, 5.0, 56.0, 4.5, 0.31))
+    evidence = level_evidence(fit, LevelInputs(0.0, 0.5, SIZE, tuple(views)), {})
+    summary = summary_of(evidence)
+    assert summary.mistakes == ("place in depth of board: 3.1 ± 0.4 mm (shown)",)
+    assert len(summary.inputs_sha256) == 64
+    result = replace(level_result(fit, 0.0, 0.5, held_out={}), evidence=summary)
+    level = LevelReport(result, fit=fit, evidence=evidence_to_document(evidence))
+    text = words(render_report(report([level])))
+    assert "Nothing in the residuals speaks against the lens model." in text
+    order = ["+3.1 ± 0.4 mm 3 mm shown", "+0.1 ± 0.9 mm 3 mm not shown", "cannot be told"]
+    assert [text.find(part) for part in order] == sorted(text.find(part) for part in order)
+    assert text.find(order[0]) > 0
+    assert "with the nodal offset as given" in text
 
 
 @pytest.mark.parametrize(
