@@ -15,9 +15,11 @@ from calibration.image import Transfer
 from calibration.types import FloatArray, Picture
 
 _ODD_CHI2, _ODD_MISFIT = 1.8, 0.015
-"""Median squared residual over the noise from which on a side may be no plain edge, so that a strip is tried; and
-residual over the contrast from which on what is left of it widens the side's place as far as it could have moved it. In
-pictures with hardly any noise the shape of a real blur shows against the first, not against the second."""
+"""Median squared residual over the noise, and residual over the contrast, from which on a side is no plain edge, so
+that what is left of the misfit widens its place as far as it could have moved it. In pictures with hardly any noise the
+shape of a real blur shows against the first, not against the second."""
+_TRIED_MISFIT = 0.01
+"""The same from which on a strip is tried: it costs as much as all the rest, and a real blur's shape stays below."""
 _STRIP_ROOM_PX, _STRIP_LINES = 4.0, 80
 _STRIP_SYSTEMATIC_PX = 0.02
 """What a strip between its two levels and one share leaves: a penumbra has another shape, light comes back into it."""
@@ -59,7 +61,7 @@ def fit_sides(
     sides = fit.sides()
     if sides is None:
         return None
-    odd = [index for index, side in enumerate(sides) if side.chi2 > _ODD_CHI2]
+    odd = [index for index, side in enumerate(sides) if _is_odd(side.chi2, side.contrast, _TRIED_MISFIT)]
     if not odd:
         return sides
     wide = EdgeFit(
@@ -138,6 +140,6 @@ def _misfit_px(chi2: float, freedom: float, information: float) -> float:
     return math.sqrt(max(chi2 - 1.0, 0.0) * freedom / information)
 
 
-def _is_odd(chi2: float, contrast: float) -> bool:
+def _is_odd(chi2: float, contrast: float, misfit: float = _ODD_MISFIT) -> bool:
     """Whether a side fits badly: against the noise, and against its ``contrast`` over the noise."""
-    return chi2 > _ODD_CHI2 and math.sqrt(chi2 - 1.0) > _ODD_MISFIT * contrast
+    return chi2 > _ODD_CHI2 and math.sqrt(chi2 - 1.0) > misfit * contrast
