@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -424,6 +425,11 @@ def _finite(value: Any) -> Any:
 
 def _list(value: tuple[Any, ...] | None) -> list[Any] | None:
     return None if value is None else list(value)
+
+
+def evidence_path(table: Path) -> Path:
+    """Where a lens table's evidence lies: ``NAME.evidence.json`` beside ``NAME.json``."""
+    return table.with_name(f"{table.stem}.{EVIDENCE_FILE}")
 
 
 def evidence_file(levels: Iterable[Mapping[str, Any]]) -> bytes:

@@ -21,7 +21,7 @@ from app.report import picture_set_report, write_report
 from app.settings import default_cpu_workers
 from calibration.tables import LensTable, LevelResult, LevelStatus
 from engine_adapters.folder import FolderPictures
-from storage.evidence import EVIDENCE_FILE, evidence_file, evidence_to_document
+from storage.evidence import evidence_file, evidence_path, evidence_to_document
 from storage.exports import EXPORTS
 from storage.schemas import table_to_document
 
@@ -42,7 +42,7 @@ def calibrate(
             "pictures center_shift, fov, k1, k2 of each level with camera and target poses"
         ),
     ] = Method.JOINT,
-    out: Annotated[Path | None, typer.Option(help="lens table (JSON) to write, evidence.json beside it")] = None,
+    out: Annotated[Path | None, typer.Option(help="lens table (JSON) to write, NAME.evidence.json beside it")] = None,
     report: Annotated[Path | None, typer.Option(help="report (HTML) to write")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the lens table as JSON on standard output")] = False,
 ) -> None:
@@ -62,7 +62,7 @@ def calibrate(
         if out is not None:
             write_file(out, EXPORTS["json"].write(table))
             told = [evidence_to_document(level.evidence) for level in levels if level.evidence is not None]
-            write_file(out.with_name(EVIDENCE_FILE), evidence_file(told))
+            write_file(evidence_path(out), evidence_file(told))
         if report is not None:
             facts = [("method", table.method), ("pictures", f"{len(described.pictures)}")]
             write_report(report, picture_set_report(f"{table.lens} on {table.camera}", table, levels, facts))

@@ -26,7 +26,7 @@ from app.cli.tables import show_table, tell_failed
 from app.documents import read_job
 from app.engines import Engines
 from app.report import LevelReport, RunReport, write_report
-from storage.evidence import EVIDENCE_FILE, evidence_file
+from storage.evidence import evidence_file, evidence_path
 from storage.exports import EXPORTS
 from storage.schemas import table_to_document
 
@@ -37,7 +37,7 @@ def run(
         Path | None,
         typer.Option(metavar="PROFILE", help="studio profile (TOML) [default: the first of LENSMATCH_PROFILES]"),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="lens table (JSON) to write, evidence.json beside it")] = None,
+    out: Annotated[Path | None, typer.Option(help="lens table (JSON) to write, NAME.evidence.json beside it")] = None,
     report: Annotated[Path | None, typer.Option(help="report (HTML) to write")] = None,
     database: Annotated[Path | None, typer.Option(help="SQLite file that keeps the job and its levels")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the lens table as JSON on standard output")] = False,
@@ -64,7 +64,7 @@ def run(
             finished = asyncio.run(run_job(settings, engines, request, show))
         if out is not None:
             write_file(out, EXPORTS["json"].write(finished.table))
-            write_file(out.with_name(EVIDENCE_FILE), evidence_file(finished.evidence.values()))
+            write_file(evidence_path(out), evidence_file(finished.evidence.values()))
         if report is not None:
             write_report(report, job_report(finished))
         if as_json:

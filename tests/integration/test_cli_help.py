@@ -82,7 +82,7 @@ def test_the_version_is_printed() -> None:
         (["calibrate", "x", "--colour", "red"], "--colour"),
         (["export", "t.json", "--format", "xyz", "--out", "o"], "there are: json, csv"),
         (["import", "t.json", "--format", "xyz"], "there are: json, csv"),
-        (["bench", "nothing"], "there are: levels, detect, "),
+        (["bench", "nothing"], "there are: levels, "),
         (["simulate", "--fault", "r3:melt@1"], "no fault is called melt"),
         (["simulate", "--lens", "none such"], "no embedded lens"),
         (["simulate", "--r3-port", "70000"], "65535"),
