@@ -10,14 +10,14 @@ and a hand-held board whose poses nobody knows. True values must lie within one 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.rows import Column, Progress, Row, decimals, percent, readable
 from calibration.compare import overlay, predicted_overlay
 from calibration.detect.target import find_target
 from calibration.errors import CalibrationError
@@ -46,9 +46,6 @@ _DISTANCE_M = 5.0
 _SHARP_PX = 0.6
 _RED, _WHITE = (0, 0, 255), (255, 255, 255)
 _PLACES = ((0, 0), (-1, 0), (1, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1))
-
-Progress = Callable[[float], None]
-Row = dict[str, object]
 
 
 @dataclass(frozen=True)
@@ -102,22 +99,13 @@ def run(*, quick: bool = False, progress: Progress | None = None) -> list[Row]:
     return rows + [_row("all", name, every, (name,)) for name in QUANTITIES]
 
 
-def columns() -> list[tuple[str, Callable[[Any], str]]]:
+def columns() -> list[Column]:
     """How a person reads the rows."""
 
-    def number(digits: int) -> Callable[[Any], str]:
-        return lambda value: "" if value is None else f"{value:.{digits}f}"
-
-    def share(value: Any) -> str:
-        return "" if value is None else f"{100 * value:.1f} %"
-
-    def text(value: Any) -> str:
-        return "" if value is None else str(value)
-
     return [
-        *(("case", text), ("method", text), ("levels", text), ("refused", text), ("errors", text)),
-        *(("within_1_sigma", share), ("within_1_96_sigma", share), ("pull_rms", number(3))),
-        *(("expected_overlay_px", number(4)), ("true_overlay_px", number(4))),
+        *(("case", readable), ("method", readable), ("levels", readable), ("refused", readable), ("errors", readable)),
+        *(("within_1_sigma", percent(1)), ("within_1_96_sigma", percent(1)), ("pull_rms", decimals(3))),
+        *(("expected_overlay_px", decimals(4)), ("true_overlay_px", decimals(4))),
     ]
 
 

@@ -17,7 +17,6 @@ import tempfile
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from app.cli.simulated import studio_engines, studio_job, studio_profile, true_l
 from app.engines import EngineFacts
 from app.settings import Settings
 from benchmarks.engine_corners import SENSOR_MM, SIZE, CornerEngine, Level, level_of, random_lens
+from benchmarks.rows import Column, Progress, Row, readable
 from calibration.camera import project_target
 from calibration.compare import overlay
 from calibration.errors import CalibrationError, NotEnoughData
@@ -70,8 +70,6 @@ _PAIR = 2
 _LEVELS_OF_A_JOB = 4
 
 Array = NDArray[np.float64]
-Row = dict[str, object]
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -458,27 +456,21 @@ async def _job(name: str, settings: tuple[str, ...]) -> Row:
     return row | {"engine_overlay_px": max(seen) if seen else None}
 
 
-def columns() -> list[tuple[str, Callable[[Any], str]]]:
+def columns() -> list[Column]:
     """How a person reads the rows: column and format."""
 
-    def text(value: Any) -> str:
-        return "" if value is None else str(value)
-
-    def number(value: Any) -> str:
-        return "" if value is None else f"{value:.4g}"
-
     return [
-        ("case", text),
-        ("method", text),
-        ("levels", text),
-        ("renders_median", number),
-        ("renders_mean", number),
-        ("renders_max", number),
-        ("failures", text),
-        ("silent_failures", text),
-        ("not_claimed", text),
-        ("learning_median", number),
-        ("learning_max", number),
-        ("trusted", text),
-        ("engine_overlay_px", number),
+        ("case", readable),
+        ("method", readable),
+        ("levels", readable),
+        ("renders_median", readable),
+        ("renders_mean", readable),
+        ("renders_max", readable),
+        ("failures", readable),
+        ("silent_failures", readable),
+        ("not_claimed", readable),
+        ("learning_median", readable),
+        ("learning_max", readable),
+        ("trusted", readable),
+        ("engine_overlay_px", readable),
     ]

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +30,7 @@ from benchmarks.level_fits import (
     pull_rms,
     study,
 )
+from benchmarks.rows import Column, Progress, Row, decimals, percent, readable
 from calibration.camera import camera_rotation, inside_picture, project_target, rays_of
 from calibration.compare import NEGLIGIBLE_PX, edge_effect_px
 from calibration.detect.target import find_target
@@ -58,8 +58,6 @@ from engine_adapters.sim.room import build_room
 
 import cv2  # isort: skip  (calibration.image sets OpenCV's bound on picture sizes before its first import)
 
-Row = dict[str, object]
-Progress = Callable[[float], None]
 PLOTS = (
     ("overlay_max_px", "largest overlay error, px"),
     ("rms_px", "residual RMS per coordinate, px"),
@@ -326,32 +324,23 @@ def _around(middle_deg: float) -> Iterator[tuple[float, float]]:
             yield middle_deg + pan, tilt
 
 
-def columns() -> list[tuple[str, Callable[[Any], str]]]:
+def columns() -> list[Column]:
     """How a person reads the rows: column and format."""
 
-    def number(digits: int) -> Callable[[Any], str]:
-        return lambda value: "" if value is None else f"{value:.{digits}f}"
-
-    def percent(value: Any) -> str:
-        return "" if value is None else f"{100 * value:.2f} %"
-
-    def text(value: Any) -> str:
-        return "" if value is None else str(value)
-
     return [
-        ("case", text),
-        ("method", text),
-        ("pictures", text),
-        ("points", text),
-        ("rms_px", number(4)),
-        ("outliers", percent),
-        ("held_out_px", number(4)),
-        ("overlay_max_px", number(4)),
-        ("k1_error", percent),
-        ("k2_error", percent),
-        ("pull_rms", number(2)),
-        ("evaluations", text),
-        ("cpu_ms", number(1)),
-        ("ratio", number(2)),
-        ("note", text),
+        ("case", readable),
+        ("method", readable),
+        ("pictures", readable),
+        ("points", readable),
+        ("rms_px", decimals(4)),
+        ("outliers", percent(2)),
+        ("held_out_px", decimals(4)),
+        ("overlay_max_px", decimals(4)),
+        ("k1_error", percent(2)),
+        ("k2_error", percent(2)),
+        ("pull_rms", decimals(2)),
+        ("evaluations", readable),
+        ("cpu_ms", decimals(1)),
+        ("ratio", decimals(2)),
+        ("note", readable),
     ]

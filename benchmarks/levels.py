@@ -12,7 +12,6 @@ import math
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from app.cli.jobs import run_job
 from app.cli.simulated import (
@@ -27,6 +26,7 @@ from app.cli.simulated import (
 from app.documents import JobRequest
 from app.engines import Engines
 from app.settings import Settings
+from benchmarks.rows import Column, Progress, Row, decimals, percent, readable
 from calibration.compare import overlay, relative_errors
 from calibration.tables import LensTable
 from engine_adapters.sim.launch import launched_studio
@@ -41,9 +41,6 @@ PLOTS = (
     ("overlay_max_px", "largest overlay error, px"),
     ("seconds", "time, s"),
 )
-
-Progress = Callable[[float], None]
-Row = dict[str, object]
 
 
 def run(*, quick: bool = False, progress: Progress | None = None) -> list[Row]:
@@ -183,29 +180,20 @@ async def _slow_way(lens: ZoomLens, level: tuple[float, float]) -> Row:
     return rows[0]
 
 
-def columns() -> list[tuple[str, Callable[[Any], str]]]:
+def columns() -> list[Column]:
     """How a person reads the rows: column and format."""
 
-    def number(digits: int) -> Callable[[Any], str]:
-        return lambda value: "" if value is None else f"{value:.{digits}f}"
-
-    def percent(value: Any) -> str:
-        return "" if value is None else f"{100 * value:.2f} %"
-
-    def text(value: Any) -> str:
-        return "" if value is None else str(value)
-
     return [
-        ("case", text),
-        ("method", text),
-        ("status", text),
-        ("scenario", text),
-        ("pictures", lambda value: "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)),
-        ("seconds", number(2)),
-        ("engine_bound_s", number(2)),
-        ("overlay_rms_px", number(4)),
-        ("overlay_max_px", number(4)),
-        ("fov_error", percent),
-        ("k1_error", percent),
-        ("k2_error", percent),
+        ("case", readable),
+        ("method", readable),
+        ("status", readable),
+        ("scenario", readable),
+        ("pictures", readable),
+        ("seconds", decimals(2)),
+        ("engine_bound_s", decimals(2)),
+        ("overlay_rms_px", decimals(4)),
+        ("overlay_max_px", decimals(4)),
+        ("fov_error", percent(2)),
+        ("k1_error", percent(2)),
+        ("k2_error", percent(2)),
     ]

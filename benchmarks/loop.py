@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,13 @@ import numpy as np
 from app.cli.jobs import run_job
 from app.cli.simulated import studio_engines, studio_job, studio_profile, study_levels
 from app.settings import Settings
+from benchmarks.rows import Progress
 from engine_adapters.sim.launch import launched_studio
 from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded
 
 _TICK_S = 0.005
 _IDLE_S = 2.0
 PLOTS = (("lag_p99_ms", "delay of the event loop, 99th percentile, ms"),)
-
-Progress = Callable[[float], None]
 
 
 def run(*, quick: bool = False, progress: Progress | None = None) -> list[dict[str, object]]:

@@ -14,12 +14,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Progress, Row
 from calibration.detect.target import find_target
 from calibration.errors import CalibrationError
 from calibration.image import decode_picture
@@ -43,9 +44,6 @@ _PANS, _PAN_SHARE = 9, 0.7
 _SEEDS, _QUICK_SEEDS = 12, 2
 _FILL = 0.4
 PLOTS = (("error_mm", "error of the nodal offset, RMS, mm"), ("parallax_px", "parallax left over a whole pan, px"))
-
-Progress = Callable[[float], None]
-Row = dict[str, object]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,13 @@ import asyncio
 import base64
 import statistics
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from app.bootstrap import make_studio
 from app.cli.simulated import studio_profile
+from benchmarks.rows import Progress, Row
 from calibration.detect.target import find_target
 from calibration.errors import InvalidInput
 from calibration.image import decode_picture
@@ -38,9 +38,6 @@ PLOTS = (
     ("ms_overlapped", "time for a picture, decoded while the next is fetched, ms"),
     ("mib", "size of an answer, MiB"),
 )
-
-Progress = Callable[[float], None]
-Row = dict[str, object]
 
 
 def run(*, quick: bool = False, progress: Progress | None = None) -> list[Row]:

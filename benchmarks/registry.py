@@ -10,14 +10,10 @@ from __future__ import annotations
 import importlib
 import os
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
 
-Row = dict[str, object]
-Progress = Callable[[float], None]
-Column = tuple[str, Callable[[Any], str]]
+from benchmarks.rows import Column, Progress, Row, readable
 
 _LIBRARIES = ("numpy", "scipy", "opencv-python-headless")
 
@@ -79,15 +75,6 @@ BENCHMARKS = {
         ),
     )
 }
-
-
-def readable(value: Any) -> str:
-    """A figure in at most five digits, a text as it is, nothing for None."""
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return str(value)
 
 
 def machine() -> dict[str, object]:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from benchmarks.rows import Progress
 from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded
 from engine_adapters.sim.optics import View
 from engine_adapters.sim.render import render_real, render_virtual
@@ -18,8 +19,6 @@ _TURNS = 40
 _QUICK_TURNS = 8
 _STEP_DEG = 0.013
 PLOTS = (("render_ms", "processor time for a picture, ms"),)
-
-Progress = Callable[[float], None]
 
 
 def run(*, quick: bool = False, progress: Progress | None = None) -> list[dict[str, object]]:

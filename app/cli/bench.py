@@ -13,7 +13,8 @@ import typer
 from app.cli.console import check_out, print_json, progress_bar, reported_errors, say, write_file, wrong_usage
 from app.cli.tables import plain_table, print_table
 from app.report.bench import BenchSection, bench_page
-from benchmarks.registry import BENCHMARKS, Benchmark, Row, machine
+from benchmarks.registry import BENCHMARKS, Benchmark, machine
+from benchmarks.rows import Row
 
 
 def bench(
