@@ -39,10 +39,10 @@ class NoRunner:
     """These tests write the ledger themselves."""
 
     async def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobRecord:
-        raise NotImplementedError
+        raise AssertionError("watching a job must not submit one")
 
     async def cancel(self, job_id: str) -> JobRecord:
-        raise NotImplementedError
+        raise AssertionError("watching a job must not cancel one")
 
     def engines(self) -> Sequence[EngineInfo]:
         return ()

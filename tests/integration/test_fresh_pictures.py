@@ -79,7 +79,7 @@ class DelayedStudio:
         pass
 
     async def tracking(self) -> TrackedCamera:
-        raise NotImplementedError
+        raise AssertionError("taking a picture must not ask for tracking")
 
     async def fetch(self) -> EncodedFrame:
         asked_s = time.monotonic()

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from app.report.bench import BenchSection, bench_page, dot_plot
 from app.report.dots import draw_dots
-from benchmarks.registry import readable
+from benchmarks.rows import readable
 
 ROWS: list[dict[str, object]] = [
     {"case": "sharp", "method": "ours", "rmse_px": 0.002, "found": True},
