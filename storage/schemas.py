@@ -59,6 +59,8 @@ Count = Annotated[int, Field(strict=True, ge=0)]
 Side = Annotated[int, Field(strict=True, ge=2, le=tables.MAX_PICTURE_SIDE_PX)]
 Name = Annotated[str, Field(strict=True, min_length=1, max_length=tables.MAX_NAME_LENGTH)]
 Text = Annotated[str, Field(strict=True)]
+_Row = tuple[Number, Number, Number, Number, Number]
+Correlation = tuple[_Row, _Row, _Row, _Row, _Row]
 Moment = Annotated[
     datetime,
     BeforeValidator(_parse_utc),
@@ -85,6 +87,9 @@ class SigmaDocument(_Document):
     k2: NotNegative | None = None
     center_shift_px: tuple[NotNegative, NotNegative] | None = None
     nodal_offset_mm: NotNegative | None = None
+    correlation: Correlation | None = Field(
+        default=None, description=f"of the errors of {', '.join(tables.SIGMA_PARAMETERS)}; null: not kept"
+    )
 
 
 class FramesDocument(_Document):
@@ -141,6 +146,19 @@ class InterpolationDocument(_Document):
 
     kind: Name
     held_out_px: PixelErrorDocument | None = Field(default=None, description="at levels left out of it, px")
+
+
+class ProvenanceDocument(_Document):
+    """Where a table comes from."""
+
+    source: Name = Field(description="calibrated, imported, corrected, rolled back, ...")
+    software: Name = Field(description="name and version of what made it")
+    job_id: Text | None = None
+    profile: Text | None = Field(default=None, description="the studio profile of its engine")
+    profile_sha256: Text | None = None
+    inputs_sha256: Text | None = Field(default=None, description="over all levels' inputs, or of the imported file")
+    parent_sha256: Text | None = Field(default=None, description="of the table that it was made from")
+    note: Text | None = None
 
 
 class LevelDocument(_Document):
@@ -206,6 +224,7 @@ class LensTableDocument(_Document):
     method: Name = Field(description="how the levels were solved: joint, alternating, ...")
     levels: tuple[LevelDocument, ...] = Field(min_length=1)
     interpolation: InterpolationDocument | None = None
+    provenance: ProvenanceDocument | None = Field(default=None, description="null: not kept")
 
 
 def lens_table_schema_text() -> str:
@@ -234,6 +253,8 @@ def table_to_document(table: tables.LensTable) -> dict[str, Any]:
             "kind": table.interpolation.kind,
             "held_out_px": _pixel_error(table.interpolation.held_out_px),
         }
+    if table.provenance is not None:
+        document["provenance"] = asdict(table.provenance)
     return document
 
 
@@ -259,6 +280,7 @@ def level_to_document(level: tables.LevelResult) -> dict[str, Any]:
             "k2": _optional(sigma.k2),
             "center_shift_px": _pair(sigma.center_shift_px),
             "nodal_offset_mm": _optional(sigma.nodal_offset_mm),
+            **({} if sigma.correlation is None else {"correlation": [list(row) for row in sigma.correlation]}),
         },
         "residual_px": _pixel_error(level.residual_px),
         "held_out_px": _pixel_error(level.held_out_px),
@@ -311,6 +333,7 @@ def document_to_table(document: object) -> tables.LensTable:
             sensor_mm=read.sensor_mm,
             pixel_aspect=read.pixel_aspect,
             interpolation=interpolation,
+            provenance=tables.Provenance(**read.provenance.model_dump()) if read.provenance else None,
         )
     except CalibrationError as error:
         raise BadDocument("", str(error), _REPAIR) from error

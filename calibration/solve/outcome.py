@@ -111,6 +111,7 @@ def level_result(
             k2=None if "k2" in fit.untold else float(sigma[2]),
             center_shift_px=None if "center_shift_px" in fit.untold else (float(sigma[3]), float(sigma[4])),
             nodal_offset_mm=None if "nodal_offset_mm" in reasons else fit.sigma_nodal_mm,
+            correlation=_correlation(fit.covariance),
         ),
         residual_px=PixelError(fit.rms_px, fit.max_px),
         held_out_px=held,
@@ -121,6 +122,18 @@ def level_result(
         scenario=1 if edge_effect_px(fit.lens)[1] <= NEGLIGIBLE_PX else 2,
         left_out=every_left_out,
     )
+
+
+def _correlation(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
+    """Correlation of (fov_x_deg, k1, k2, sx, sy) from the covariance of (f_px, k1, k2, sx, sy): the field of view
+    shrinks as the focal length grows. None where a quantity has no sigma."""
+    sigma = np.sqrt(np.diag(covariance))
+    if not np.all(np.isfinite(sigma)) or np.min(sigma) <= 0:
+        return None
+    signed = sigma * np.array([-1.0, 1.0, 1.0, 1.0, 1.0])
+    correlation = np.clip(covariance / np.outer(signed, signed), -1, 1)
+    np.fill_diagonal(correlation, 1.0)
+    return tuple(tuple(row) for row in ((correlation + correlation.T) / 2).tolist())
 
 
 def _outliers(fit: LevelFit) -> list[LeftOut]:

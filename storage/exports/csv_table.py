@@ -3,8 +3,8 @@
 RFC 4180 (commas, CRLF, doubled quotes), UTF-8, one header row with units in the names. What holds for the whole
 table (``lens`` to ``interpolation_...``) is repeated in every row, so that rows can be sorted, filtered and joined; on
 reading, all rows must agree on it. Columns may stand in any order and further columns are ignored. Numbers have all
-their digits; an empty cell is "not told". ``left_out``, ``reasons``, ``engine_values`` and
-``parallax`` hold JSON.
+their digits; an empty cell is "not told". ``provenance``, ``correlation``,
+``left_out``, ``reasons``, ``engine_values``, ``parallax`` and ``evidence`` hold JSON.
 
 A text cell that a spreadsheet would take for a formula (it begins with = + - @, tab or carriage return) gets a
 leading apostrophe, which the reader takes away again.
@@ -45,6 +45,7 @@ _TABLE_COLUMNS: dict[str, tuple[_Path, str]] = {
     "interpolation_kind": (("interpolation", "kind"), _TEXT),
     "interpolation_held_out_rms_px": (("interpolation", "held_out_px", "rms"), _FLOAT),
     "interpolation_held_out_max_px": (("interpolation", "held_out_px", "max"), _FLOAT),
+    "provenance": (("provenance",), _JSON),
 }
 _LEVEL_COLUMNS: dict[str, tuple[_Path, str]] = {
     "zoom": (("zoom",), _FLOAT),
@@ -67,6 +68,7 @@ _LEVEL_COLUMNS: dict[str, tuple[_Path, str]] = {
     "sigma_center_shift_x_px": (("sigma", "center_shift_px", 0), _FLOAT),
     "sigma_center_shift_y_px": (("sigma", "center_shift_px", 1), _FLOAT),
     "sigma_nodal_offset_mm": (("sigma", "nodal_offset_mm"), _FLOAT),
+    "correlation": (("sigma", "correlation"), _JSON),
     **{
         f"{name.removesuffix('_px')}_{part}_px": ((name, part), _FLOAT)
         for name in EVIDENCE_QUANTITIES
@@ -82,7 +84,7 @@ _LEVEL_COLUMNS: dict[str, tuple[_Path, str]] = {
     "parallax": (("parallax",), _JSON),
     "evidence": (("evidence",), _JSON),
 }
-_LATER_COLUMNS = ("engine_values", "parallax", "evidence")
+_LATER_COLUMNS = ("provenance", "correlation", "engine_values", "parallax", "evidence")
 """Columns that files of earlier versions do not have; without one, nothing of it is told."""
 
 

@@ -188,7 +188,7 @@ def csv_with(old: str, new: str) -> bytes:
         (csv_with("3.0,-2.0", "3.0,"), "row 2, center_shift_y_px: is empty while the other half"),
         (csv_with("0.021,0.06", "0.021,"), r"levels\[0\].residual_px.max"),
         (csv_with("XA 20x,'-Cam0,3,", "XA 20x,'-Cam0,4,"), "row 3, version: differs from the first row"),
-        (csv_with("0.6,,", "0.6,"), "row 2: has 50 cells, the header 51"),
+        (csv_with("0.6,,", "0.6,"), "row 2: has 52 cells, the header 53"),
         (csv_with('"[{""picture""', '"[""picture""'), "row 3, left_out: is not JSON"),
         (csv_with('in 4 pictures"', "in 4 pictures"), "is not CSV"),
         ((GOLDEN / "lens_table.csv").read_bytes().split(b"\n")[0], "no row under its header"),
