@@ -10,6 +10,7 @@
     ├── AlreadyStored         this level (job, zoom, focus, attempt) was committed before
     ├── TooLarge              a picture or document larger than the store takes
     ├── BadDocument           a lens table that cannot be read: damaged, foreign, or contradicting itself
+    ├── CannotExport          a lens table that a format cannot carry at all
     ├── StorageBusy           another process held the database longer than the named bound; may be tried again
     ├── StorageFull           no space left; nothing of the refused write was kept; may be tried again
     └── DatabaseUnusable      damaged, not a database, of a newer version, of another program, not writable
@@ -93,6 +94,10 @@ class BadDocument(StorageError):
         self.field = field
         place = f"lens table, {field}" if field else "lens table"
         super().__init__(f"{place}: {why}; {todo}")
+
+
+class CannotExport(StorageError):
+    """A lens table that a format cannot carry."""
 
 
 class StorageBusy(StorageError):

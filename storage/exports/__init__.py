@@ -1,7 +1,7 @@
 """The formats of a lens table: one module each, pure table -> bytes, with a reader and a round trip.
 
-:data:`EXPORTS` holds them by name. ``write`` never fails on a valid table; ``read`` raises
-:class:`storage.errors.BadDocument`, naming the field and what to do.
+:data:`EXPORTS` holds them by name. ``write`` raises :class:`storage.errors.CannotExport` for a table that the format
+cannot carry at all; ``read`` raises :class:`storage.errors.BadDocument`, naming the field and what to do.
 """
 
 from __future__ import annotations
