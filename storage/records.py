@@ -10,6 +10,9 @@ from typing import Any
 
 from calibration.tables import LensTable, LevelResult, Provenance
 
+MAX_PAGE = 1000
+"""Most rows that one call gives back; a larger limit counts as this one."""
+
 EventDraft = tuple[str, Mapping[str, Any]]
 """An event yet to be numbered and dated: its kind and its data (JSON)."""
 

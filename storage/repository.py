@@ -25,6 +25,7 @@ from storage import models
 from storage.database import Database
 from storage.errors import AlreadyStored, EngineBusy, IdempotencyConflict, NotFound, TooLarge
 from storage.records import (
+    MAX_PAGE,
     RUNNING_STATES,
     UNFINISHED_STATES,
     EventDraft,
@@ -38,7 +39,6 @@ from storage.records import (
     PictureRecord,
 )
 from storage.rows import (
-    MAX_PAGE,
     append_event,
     event_record,
     find_job,

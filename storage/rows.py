@@ -17,6 +17,7 @@ from storage.errors import NotFound, StaleState
 from storage.exports.json_table import read_json
 from storage.records import (
     APPROVALS,
+    MAX_PAGE,
     ActionRecord,
     EventDraft,
     EventRecord,
@@ -29,9 +30,6 @@ from storage.records import (
     TableSummary,
 )
 from storage.schemas import ProvenanceDocument, document_to_level
-
-MAX_PAGE = 1000
-"""Most rows that one call gives back; a larger limit counts as this one."""
 
 
 def page_limit(limit: int) -> int:

@@ -10,6 +10,7 @@ import typer
 from app.cli.console import check_out, print_json, read_file, reported_errors, say, write_file, wrong_usage
 from app.cli.tables import show_table
 from app.documents import DocumentError
+from app.jobs.provenance import imported
 from calibration.tables import LensTable
 from storage.errors import BadDocument
 from storage.exports import EXPORTS, Export
@@ -51,7 +52,8 @@ def import_table(
     with reported_errors(as_json):
         export = _export(format_name)
         check_out(out)
-        table = _read(path, export)
+        data = read_file(path, MAX_DOCUMENT_BYTES)
+        table = imported(_parse(path, data, export), data, export)
         if out is not None:
             write_file(out, EXPORTS["json"].write(table))
         if as_json:
@@ -70,7 +72,10 @@ def _export(name: str) -> Export:
 
 
 def _read(path: Path, export: Export) -> LensTable:
-    data = read_file(path, MAX_DOCUMENT_BYTES)
+    return _parse(path, read_file(path, MAX_DOCUMENT_BYTES), export)
+
+
+def _parse(path: Path, data: bytes, export: Export) -> LensTable:
     try:
         return export.read(data)
     except BadDocument as error:
