@@ -32,7 +32,7 @@ def export_table(
     with reported_errors(as_json):
         export = _export(format_name)
         check_out(out)
-        read = _read(table, EXPORTS["json"])
+        read = read_table_file(table)
         write_file(out, export.write(read))
         if as_json:
             print_json({"out": str(out), "format": export.name, "cannot_carry": list(export.cannot_carry)})
@@ -71,8 +71,9 @@ def _export(name: str) -> Export:
     return export
 
 
-def _read(path: Path, export: Export) -> LensTable:
-    return _parse(path, read_file(path, MAX_DOCUMENT_BYTES), export)
+def read_table_file(path: Path) -> LensTable:
+    """The lens table in a JSON file. Raises :class:`app.documents.DocumentError` in one line."""
+    return _parse(path, read_file(path, MAX_DOCUMENT_BYTES), EXPORTS["json"])
 
 
 def _parse(path: Path, data: bytes, export: Export) -> LensTable:
