@@ -14,13 +14,13 @@ is solved for s, for r, and for both (least squares over all levels); what is le
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.compare import grid_pixels
-from calibration.errors import CalibrationError, InvalidInput
+from calibration.errors import CalibrationError, GeometryError, InvalidInput
 from calibration.lens import Lens
 from calibration.tables import LensTable, LevelResult, PixelError, other_picture
 from calibration.types import FloatArray
@@ -38,7 +38,11 @@ chance alone exceeds it with p < 0.003."""
 _NOTHING_PX = 1e-6
 # Rounding moves a ray by 1e-12 px; less than this is no difference to be explained.
 
+MAX_LEVELS = 2000
+"""Most levels of two tables together: two of 1,000, the most that a job measures; they take seconds."""
+
 CENTER_SHIFT, F_RATIO, BOTH = "center_shift", "f_ratio", "both"
+_COLUMNS = {CENTER_SHIFT: [0, 1], F_RATIO: [2], BOTH: [0, 1, 2]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +136,11 @@ def compare_tables(
     if difference is not None:
         raise InvalidInput("second table", second.lens, f"cannot be compared with the first: {difference}")
     sides = (_Side(first, first_at), _Side(second, second_at))
-    fields: list[_Field] = []
-    levels = tuple(_level_difference(sides, place, fields) for place in _union(sides))
+    union = sorted({*sides[0].levels, *sides[1].levels})
+    if len(union) > MAX_LEVELS:
+        raise InvalidInput("levels of both tables", len(union), f"at most {MAX_LEVELS} are compared")
+    causes = _Causes()
+    levels = tuple(_level_difference(sides, place, causes) for place in union)
     grid = _difference_map(sides, map_grid)
     told = [place for place in (*levels, *(grid.places if grid else ())) if place.difference_px is not None]
     if not told:
@@ -143,7 +150,7 @@ def compare_tables(
     squares = [place.difference_px.rms**2 for place in levels if place.difference_px is not None]
     squares = squares or [place.difference_px.rms**2 for place in told if place.difference_px is not None]
     overall = PixelError(math.sqrt(math.fsum(squares) / len(squares)), _max_px(worst))
-    return TableComparison(levels, grid, overall, worst, _explanations(fields))
+    return TableComparison(levels, grid, overall, worst, causes.explanations())
 
 
 def _max_px(place: PlaceDifference) -> float:
@@ -187,10 +194,6 @@ def _inside(value: float, limits: _Range) -> bool:
     return limits[0] <= value <= limits[1]
 
 
-def _union(sides: tuple[_Side, _Side]) -> list[tuple[float, float]]:
-    return sorted({*sides[0].levels, *sides[1].levels})
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Field:
     """At (N, 2) pixels of the first's picture: the way (N, 2) px from the first's principal point to the pixel, and
@@ -201,53 +204,52 @@ class _Field:
     way: FloatArray
 
 
-def _field(first: Lens, second: Lens) -> _Field | str:
+def _field(first: Lens, second: Lens) -> _Field:
+    """Raises :class:`GeometryError` where not every ray of the first's picture lands in the second's plane."""
     pixels = grid_pixels(first.image_size)
     rays = first.unproject(pixels)
     seen = np.isfinite(rays[..., 0])
     if not seen.any():
-        return "no pixel of the first table's picture is reached by a ray"
+        raise GeometryError("no pixel of the first table's picture is reached by a ray")
     way = (second.project(rays) - pixels)[seen]
     if not np.isfinite(way).all():
-        return "the second table's lens folds inside the first one's picture"
+        raise GeometryError("the second table's lens folds inside the first one's picture")
     return _Field(pixels[seen], pixels[seen] - np.asarray(first.principal_point_px), way)
 
 
-def _place_difference(sides: tuple[_Side, _Side], zoom: float, focus: float) -> tuple[PlaceDifference, _Field | None]:
+def _place_difference(
+    sides: tuple[_Side, _Side], zoom: float, focus: float, causes: _Causes | None = None
+) -> PlaceDifference:
+    """The difference there; its field is added to ``causes``."""
     bare = PlaceDifference(zoom, focus, (False, False))
     lenses = []
     for name, side in zip(("first", "second"), sides, strict=True):
         lens = side.lens((zoom, focus))
         if isinstance(lens, str):
-            return replace(bare, reason=f"in the {name} table it {lens}"), None
+            return replace(bare, reason=f"in the {name} table it {lens}")
         lenses.append(lens)
     first, second = lenses
     try:
         field = _field(first, second)
     except CalibrationError as error:
-        field = str(error)
-    if isinstance(field, str):
-        return replace(bare, reason=field), None
-    distance = np.hypot(field.way[:, 0], field.way[:, 1])
-    worst = field.pixels[int(np.argmax(distance))]
+        return replace(bare, reason=str(error))
+    if causes is not None:
+        causes.add(first, second, field)
+    lengths = _Lengths()
+    lengths.add(field.way)
+    worst = field.pixels[int(np.argmax(np.sum(field.way * field.way, axis=-1)))]
     shifts = (first.center_shift_px, second.center_shift_px)
-    return (
-        replace(
-            bare,
-            difference_px=_error_of([field.way]),
-            worst_px=(float(worst[0]), float(worst[1])),
-            center_shift_px=(shifts[1][0] - shifts[0][0], shifts[1][1] - shifts[0][1]),
-            f_ratio=second.f_px / first.f_px,
-        ),
-        field,
+    return replace(
+        bare,
+        difference_px=lengths.error(),
+        worst_px=(float(worst[0]), float(worst[1])),
+        center_shift_px=(shifts[1][0] - shifts[0][0], shifts[1][1] - shifts[0][1]),
+        f_ratio=second.f_px / first.f_px,
     )
 
 
-def _level_difference(sides: tuple[_Side, _Side], place: tuple[float, float], fields: list[_Field]) -> PlaceDifference:
-    """The difference at a level of either table; its field, where there is one, is appended to ``fields``."""
-    difference, field = _place_difference(sides, *place)
-    if field is not None:
-        fields.append(field)
+def _level_difference(sides: tuple[_Side, _Side], place: tuple[float, float], causes: _Causes) -> PlaceDifference:
+    difference = _place_difference(sides, *place, causes)
     first, second = (side.levels.get(place) for side in sides)
     return replace(difference, measured=(first is not None, second is not None), sigma_px=_sigma_px(first, second))
 
@@ -266,7 +268,7 @@ def _difference_map(sides: tuple[_Side, _Side], shape: tuple[int, int]) -> Diffe
     focuses = _steps(sides[0].focuses, sides[1].focuses, shape[1])
     if not zooms or not focuses:
         return None
-    places = tuple(_place_difference(sides, zoom, focus)[0] for focus in focuses for zoom in zooms)
+    places = tuple(_place_difference(sides, zoom, focus) for focus in focuses for zoom in zooms)
     return DifferenceMap(zooms, focuses, places)
 
 
@@ -278,28 +280,57 @@ def _steps(first: _Range, second: _Range, count: int) -> tuple[float, ...]:
     return (low,) if low == high else tuple(float(value) for value in np.linspace(low, high, count))
 
 
-def _error_of(ways: Sequence[FloatArray]) -> PixelError:
-    squared = np.concatenate([np.sum(way * way, axis=-1) for way in ways])
-    return PixelError(float(np.sqrt(np.mean(squared))), float(np.sqrt(np.max(squared))))
+class _Lengths:
+    """RMS and maximum of the lengths of ways (N, 2), added up field by field."""
+
+    def __init__(self) -> None:
+        self._total, self._count, self._largest = 0.0, 0, 0.0
+
+    def add(self, way: FloatArray) -> None:
+        squared = np.sum(way * way, axis=-1)
+        self._total += float(np.sum(squared))
+        self._count += squared.size
+        self._largest = max(self._largest, float(np.max(squared)))
+
+    def error(self) -> PixelError:
+        return PixelError(math.sqrt(self._total / self._count), math.sqrt(self._largest))
 
 
-def _explanations(fields: Sequence[_Field]) -> tuple[Explanation, ...]:
-    """Each cause with what it leaves; columns of the fit: shift to the right, shift down, ratio minus 1."""
-    if not fields or _error_of([field.way for field in fields]).max < _NOTHING_PX:
-        return ()
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for field in fields:
+class _Causes:
+    """The constant causes, fitted to the fields of all levels. Fields are let go once they are added, and made again
+    to see what is left: those of 1,000 levels would take 100 MB."""
+
+    def __init__(self) -> None:
+        self._pairs: list[tuple[Lens, Lens]] = []
+        self._lengths = _Lengths()
+        self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
+        # Columns: shift to the right, shift down, ratio minus 1.
+
+    def add(self, first: Lens, second: Lens, field: _Field) -> None:
+        self._pairs.append((first, second))
+        self._lengths.add(field.way)
         for axis in (0, 1):
             columns = np.zeros((len(field.way), 3))
             columns[:, axis] = 1.0
             columns[:, 2] = field.from_centre[:, axis]
-            normal += columns.T @ columns
-            right += columns.T @ field.way[:, axis]
-    found = []
-    for cause, used in ((CENTER_SHIFT, [0, 1]), (F_RATIO, [2]), (BOTH, [0, 1, 2])):
+            self._normal += columns.T @ columns
+            self._right += columns.T @ field.way[:, axis]
+
+    def explanations(self) -> tuple[Explanation, ...]:
+        """Each cause with what it leaves; empty where no level differs."""
+        if not self._pairs or self._lengths.error().max < _NOTHING_PX:
+            return ()
+        tried = [(cause, self._solved(used), _Lengths()) for cause, used in _COLUMNS.items()]
+        for first, second in self._pairs:
+            field = _field(first, second)
+            for _, solved, left in tried:
+                left.add(field.way - solved[:2] - solved[2] * field.from_centre)
+        return tuple(
+            Explanation(cause, (float(solved[0]), float(solved[1])), 1.0 + float(solved[2]), left.error())
+            for cause, solved, left in tried
+        )
+
+    def _solved(self, used: list[int]) -> FloatArray:
         solved = np.zeros(3)
-        solved[used] = np.linalg.solve(normal[np.ix_(used, used)], right[used])
-        left = [field.way - solved[:2] - solved[2] * field.from_centre for field in fields]
-        shift = (float(solved[0]), float(solved[1]))
-        found.append(Explanation(cause, shift, 1.0 + float(solved[2]), _error_of(left)))
-    return tuple(found)
+        solved[used] = np.linalg.solve(self._normal[np.ix_(used, used)], self._right[used])
+        return solved

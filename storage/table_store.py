@@ -51,11 +51,20 @@ class TableStore:
         self._database = database
         self._now = now
 
-    async def save_table(self, job_id: str | None, table: LensTable, event: EventDraft | None = None) -> TableSummary:
+    async def save_table(
+        self,
+        job_id: str | None,
+        table: LensTable,
+        event: EventDraft | None = None,
+        *,
+        by: str | None = None,
+        note: str | None = None,
+    ) -> TableSummary:
         """Store a table as the next version of its lens and camera, whatever version it says itself, with its event.
 
-        ``job_id`` None: a table of no job (it then has no event). A job has one table: saving again, as after a
-        restart, gives the stored one back and appends nothing. Raises :class:`NotFound`.
+        ``job_id`` None: a table of no job, imported or corrected as its provenance says (it then has no event).
+        A job has one table: saving again, as after a restart, gives the stored one back and appends nothing. Raises
+        :class:`NotFound`.
         """
         now = self._now()
 
@@ -65,7 +74,7 @@ class TableStore:
                 earlier = session.exec(table_rows().where(models.Table.job_id == job_id)).one_or_none()
                 if earlier is not None:
                     return table_summary(earlier, approved_table_id(session, earlier.lens_id))
-            summary = _add_table(session, table, job_id, now, None, None)
+            summary = _add_table(session, table, job_id, now, by, note)
             if job is not None and event is not None:
                 append_event(session, job, event, now)
             return summary

@@ -50,7 +50,7 @@ def _show(document: ComparisonDocument) -> None:
     grid = plain_table(
         f"{one.lens} on {one.camera}, version {one.version}, against {other.lens} on {other.camera}, "
         f"version {other.version}; distance of the same ray, px",
-        ("zoom", "focus", "rms", "max", "at u", "v", "sigmas", "shift x", "y px", "f ratio"),
+        ("zoom", "focus", "level of", "rms", "max", "at u", "v", "sigmas", "shift x", "y px", "f ratio"),
     )
     for place in document.levels:
         if place.difference_px is not None:
@@ -70,12 +70,14 @@ def _row(place: PlaceView) -> tuple[str, ...]:
     difference, worst, shift = place.difference_px, place.worst_px, place.center_shift_px
     if difference is None or worst is None or shift is None or place.f_ratio is None:
         return (f"{place.zoom:.3f}", f"{place.focus:.2f}")
+    level_of = {(True, True): "both", (True, False): "first", (False, True): "second"}[place.measured]
     sigmas = "-" if place.sigmas is None else f"{place.sigmas:.1f}"
     if place.sigmas is not None and place.sigmas > AGREEING_SIGMAS:
         sigmas = f"[yellow]{sigmas}[/]"
     return (
         f"{place.zoom:.3f}",
         f"{place.focus:.2f}",
+        level_of,
         f"{difference.rms:.3f}",
         f"{difference.max:.3f}",
         f"{worst[0]:.0f}",

@@ -65,7 +65,10 @@ def test_tables_that_agree_are_said_to(tmp_path: Path) -> None:
     assert "at most 0.050 px apart" in result.stdout
     assert "version 1, against XA 20x on Cam0, version 2" in result.stdout
     rows = [line.split() for line in result.stdout.splitlines() if line.strip().startswith(("0.0", "0.5"))]
-    assert [row[:4] for row in rows] == [["0.000", "0.00", "0.050", "0.050"], ["0.500", "0.00", "0.050", "0.050"]]
+    assert [row[:5] for row in rows] == [
+        ["0.000", "0.00", "both", "0.050", "0.050"],
+        ["0.500", "0.00", "both", "0.050", "0.050"],
+    ]
 
 
 def test_tables_that_differ_are_no_failure_and_are_explained(tmp_path: Path) -> None:

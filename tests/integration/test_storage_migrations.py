@@ -196,14 +196,18 @@ async def test_a_database_of_the_first_release_gets_a_place_for_evidence(path: P
     assert backups(path) == ["lensmatch.backup-0001-20261121T100000Z.db"]
 
 
-async def test_killed_half_way_the_first_release_is_still_there_and_is_then_upgraded(
-    path: Path, tmp_path: Path, repository: Path
+@pytest.mark.parametrize(
+    ("before_it", "file", "table"),
+    [("0001", "r0002_evidence.py", "evidence"), ("0002", "r0003_table_actions.py", "table_actions")],
+)
+async def test_killed_half_way_the_release_before_is_still_there_and_is_then_upgraded(
+    path: Path, tmp_path: Path, repository: Path, before_it: str, file: str, table: str
 ) -> None:
-    before = await Database.open(path, now, schema_of(tmp_path, "0001"))
+    before = await Database.open(path, now, schema_of(tmp_path, before_it))
     await before.close()
     deadly = tmp_path / "deadly"
     shutil.copytree(MIGRATIONS, deadly, ignore=shutil.ignore_patterns("__pycache__"))
-    step = deadly / "versions" / "r0002_evidence.py"
+    step = deadly / "versions" / file
     step.write_text(step.read_text("utf-8") + "    __import__('os')._exit(9)\n", "utf-8")
     script = (
         "import asyncio, sys; from datetime import UTC, datetime; from pathlib import Path; "
@@ -213,8 +217,8 @@ async def test_killed_half_way_the_first_release_is_still_there_and_is_then_upgr
     command = [sys.executable, "-c", script, str(path), str(deadly)]
     killed = await asyncio.to_thread(subprocess.run, command, cwd=repository, check=False, timeout=60)
     assert killed.returncode == 9
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
-    assert rows(path, "SELECT name FROM sqlite_master WHERE name = 'evidence'") == []
+    assert rows(path, "SELECT version_num FROM alembic_version") == [(before_it,)]
+    assert rows(path, f"SELECT name FROM sqlite_master WHERE name = '{table}'") == []
     async with await Repository.open(path, now) as ledger:
         await ledger.check()
     assert rows(path, "SELECT version_num FROM alembic_version") == [(NEWEST,)]

@@ -133,7 +133,9 @@ def test_a_roll_back_undoes_one_approval(steps: list[int | str]) -> None:
 async def test_how_a_table_came_is_its_first_action(ledger: Repository) -> None:
     await stored_job(ledger)
     corrected = replace(lens_table(), provenance=Provenance("corrected", "lensmatch 1"))
-    await ledger.save_table(None, corrected)
+    await ledger.save_table(None, corrected, by="Anna", note="moved by 1 px")
+    told = (await ledger.table_history(2))[0]
+    assert (told.by, told.note) == ("Anna", "moved by 1 px")
     await ledger.note_published(2, by="Anna", note="engine default, 0.02 px")
     assert await actions(ledger, 1) == [("calibrated", 1, None)]
     assert await actions(ledger, 2) == [("corrected", 2, None), ("published", 2, None)]
@@ -147,6 +149,20 @@ async def test_provenance_stands_in_the_list(ledger: Repository) -> None:
     await ledger.save_table(None, lens_table())
     assert [table.provenance for table in await ledger.list_tables(1)] == [None, told]
     assert (await ledger.get_table(1)).table.provenance == told
+
+
+async def test_a_table_and_how_it_came_are_stored_together_or_not_at_all(
+    ledger: Repository, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("in the middle")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("storage.table_store._add_action", fail)
+        with pytest.raises(RuntimeError, match="in the middle"):
+            await ledger.import_table(lens_table())
+    assert await ledger.list_lenses() == []
+    assert (await ledger.import_table(lens_table()))[0].version == 1
 
 
 # Imports

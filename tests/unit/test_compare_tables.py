@@ -277,3 +277,11 @@ def test_tables_of_other_pictures_are_not_compared(change: dict[str, Any], told:
         return
     with pytest.raises(InvalidInput, match="cannot be compared with the first: " + told):
         compare_tables(first, second)
+
+
+def test_more_levels_than_two_jobs_measure_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calibration.compare_tables.MAX_LEVELS", 7)
+    other = table([(0.1, 0.1), (0.2, 0.2)])
+    with pytest.raises(InvalidInput, match="levels of both tables = 8: at most 7 are compared"):
+        compare_tables(table(PLACES), other)
+    assert compare_tables(table(PLACES), table(PLACES)).levels

@@ -19,6 +19,16 @@ depends_on: str | None = None
 _GUARDED = {"tables": "lens tables never change", "table_actions": "table actions are append-only"}
 
 
+def _provenance(document: str) -> str | None:
+    try:
+        provenance = json.loads(document).get("provenance")
+    except (ValueError, AttributeError):
+        return None  # a damaged document says so where it is read; the rest of the database is of use without it
+    if provenance is None:
+        return None
+    return json.dumps(provenance, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+
+
 def upgrade() -> None:
     """Make the ledger and what guards it; tables of before have no actions, and the provenance their document has."""
     op.create_table(
@@ -49,13 +59,3 @@ def upgrade() -> None:
                 f"CREATE TRIGGER {table}_refuse_{change.lower()} BEFORE {change} ON {table} "
                 f"BEGIN SELECT RAISE(ABORT, '{why}'); END"
             )
-
-
-def _provenance(document: str) -> str | None:
-    try:
-        provenance = json.loads(document).get("provenance")
-    except (ValueError, AttributeError):
-        return None  # a damaged document says so where it is read; the rest of the database is of use without it
-    if provenance is None:
-        return None
-    return json.dumps(provenance, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
