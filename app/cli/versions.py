@@ -60,7 +60,7 @@ def _show(document: ComparisonDocument) -> None:
         if place.reason is not None:
             where = f"zoom {place.zoom:.3f}, focus {place.focus:.2f}"
             messages.print(f"[dim]{where}: not compared, {escape(place.reason)}[/]")
-    for found in document.explanations:
+    for found in () if document.agree else document.explanations:
         left = found.left_px
         results.print(f"without {in_words(found)}: {left.rms:.3f} px RMS, {left.max:.3f} px at most")
     results.print(escape(document.verdict))

@@ -63,6 +63,7 @@ def test_tables_that_agree_are_said_to(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     assert "agree within their stated sigmas (0.4 at most)" in result.stdout
     assert "at most 0.050 px apart" in result.stdout
+    assert "constant" not in result.stdout, "chance needs no explanation"
     assert "version 1, against XA 20x on Cam0, version 2" in result.stdout
     rows = [line.split() for line in result.stdout.splitlines() if line.strip().startswith(("0.0", "0.5"))]
     assert [row[:5] for row in rows] == [
