@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.engines import EngineFacts, Engines, PictureFacts, Studio
+from app.engines import EngineFacts, Engines, PictureFacts, ProfileFacts, Studio
 from app.events import EventBroker
 from app.jobs.cpu import Cpu
 from app.jobs.runner import JobRunner
@@ -18,11 +18,13 @@ from engine_adapters.head.operator import AskOperator, OperatorHead
 from engine_adapters.head.simulated import SimulatedHead
 from engine_adapters.mockboard.client import MockBoardFrames
 from engine_adapters.ports import CameraHead, FrameSource, HeadState
-from engine_adapters.profile import StudioProfile, load_profile, require_available
+from engine_adapters.profile import StudioProfile, load_profile, profile_sha256, require_available
 from engine_adapters.r3.client import R3Engine, R3Snapshots
 from storage.repository import Repository
 
 DEFAULT_ENGINE = "default"
+DEFAULT_PROFILE = "defaults"
+"""Name of the profile of an engine that was given none: every key has its default."""
 
 THREAD_SWITCH_S = 0.001
 """How long a thread of the numerics may hold the interpreter against the event loop. With Python's own 5 ms the loop's
@@ -83,13 +85,20 @@ def engine_facts(profile: StudioProfile) -> EngineFacts:
 
 
 def add_engine(
-    engines: Engines, name: str, profile: StudioProfile, ask: AskOperator | None = None, *, slow_pictures: bool = False
+    engines: Engines,
+    name: str,
+    profile: StudioProfile,
+    ask: AskOperator | None = None,
+    *,
+    slow_pictures: bool = False,
+    profile_name: str = DEFAULT_PROFILE,
 ) -> None:
-    """Make a profile's engine known under ``name``."""
+    """Make a profile's engine known under ``name``. ``profile_name``: that of its file, for what a table came from."""
     require_available(profile)
     address = f"r3 {profile.r3.host}:{profile.r3.port}, pictures {profile.mockboard.url}"
     pictures = PictureFacts(profile.picture.image_size, profile.picture.pixel_aspect)
-    engines.add(name, address, lambda: make_studio(profile, ask, slow_pictures=slow_pictures), pictures)
+    known = ProfileFacts(profile_name, profile_sha256(profile))
+    engines.add(name, address, lambda: make_studio(profile, ask, slow_pictures=slow_pictures), pictures, known)
 
 
 def load_engines(paths: Sequence[Path]) -> Engines:
@@ -103,7 +112,7 @@ def load_engines(paths: Sequence[Path]) -> Engines:
         add_engine(engines, DEFAULT_ENGINE, StudioProfile())
     for index, path in enumerate(paths):
         name = DEFAULT_ENGINE if index == 0 else path.stem
-        add_engine(engines, name, load_profile(path))
+        add_engine(engines, name, load_profile(path), profile_name=path.stem)
     return engines
 
 

@@ -44,6 +44,14 @@ class PictureFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class ProfileFacts:
+    """Which studio profile an engine has: its name, and the SHA-256 of its canonical text, hexadecimal."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
 class EngineFacts:
     """What a studio profile says of how its engine counts, in the profile's own words (``engine.*``)."""
 
@@ -116,6 +124,7 @@ class _Slot:
     address: str
     connect: Callable[[], Studio]
     pictures: PictureFacts | None
+    profile: ProfileFacts | None
     job_id: str | None = None
     dirty: str | None = None
     found: EngineState | None = None
@@ -137,12 +146,20 @@ class Engines:
     def __init__(self) -> None:
         self._slots: dict[str, _Slot] = {}
 
-    def add(self, name: str, address: str, connect: Callable[[], Studio], pictures: PictureFacts | None = None) -> None:
+    def add(
+        self,
+        name: str,
+        address: str,
+        connect: Callable[[], Studio],
+        pictures: PictureFacts | None = None,
+        profile: ProfileFacts | None = None,
+    ) -> None:
         """Make an engine known. ``connect`` makes its adapters; connections are opened at their first use.
 
         ``pictures``: what its profile says of its pictures, for :meth:`require_pictures`; None: nothing is known.
+        ``profile``: which one that is, for :meth:`profile`.
         """
-        self._slots[name] = _Slot(address, connect, pictures)
+        self._slots[name] = _Slot(address, connect, pictures, profile)
 
     def names(self) -> Iterable[str]:
         return tuple(self._slots)
@@ -152,6 +169,11 @@ class Engines:
             EngineInfo(name, slot.address, slot.job_id, slot.dirty, slot.found.exports if slot.found else ())
             for name, slot in self._slots.items()
         ]
+
+    def profile(self, name: str) -> ProfileFacts | None:
+        """The studio profile of an engine, None where that is not known. Raises :class:`UnknownEngine`."""
+        self.require(name)
+        return self._slots[name].profile
 
     def require(self, name: str) -> None:
         """Raise :class:`UnknownEngine` unless there is an engine of this name."""

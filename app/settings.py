@@ -61,6 +61,12 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(
         default=MIB, ge=1024, le=1024 * MIB, description="largest request body, bytes; a job of 1,000 levels has 60 KB"
     )
+    max_table_bytes: int = Field(
+        default=16 * MIB,
+        ge=1024,
+        le=64 * MIB,
+        description="largest lens table file taken by POST /tables, bytes; a table of 1,000 levels has 2 MB",
+    )
     queue_limit: int = Field(default=100, ge=1, le=100_000, description="most jobs that may wait, jobs")
     retry_after_s: int = Field(
         default=30, ge=1, le=3600, description="when a client refused for lack of room should ask again, seconds"

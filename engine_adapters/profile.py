@@ -6,6 +6,7 @@ lens: the product compares it with what a few renders show and says where they d
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import tomllib
@@ -309,6 +310,15 @@ def profile_toml(profile: StudioProfile | None = None) -> str:
     lines = ["# Lensmatch studio profile: how to speak to one engine. Keys that are left out have these defaults."]
     _write_section(lines, profile or StudioProfile(), "")
     return "\n".join(lines) + "\n"
+
+
+def profile_sha256(profile: StudioProfile) -> str:
+    """SHA-256, hexadecimal, of a profile's canonical text: every key with its value, the defaults too, as sorted JSON.
+
+    Files that say the same in another order, or leave out defaults, have the same.
+    """
+    canonical = json.dumps(profile.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def _write_section(lines: list[str], section: BaseModel, path: str) -> None:

@@ -8,6 +8,9 @@
     ├── StaleState            the job is no longer in the state that the caller took it to be in
     ├── EngineBusy            another job is already running on that engine
     ├── AlreadyStored         this level (job, zoom, focus, attempt) was committed before
+    ├── NameClash             the lens and camera have tables of another picture or sensor
+    ├── NotApproved           a table that is not (or no longer) the approved one of its lens cannot be rolled back
+    ├── NothingBefore         no other table was approved before this one
     ├── TooLarge              a picture or document larger than the store takes
     ├── BadDocument           a lens table that cannot be read: damaged, foreign, or contradicting itself
     ├── CannotExport          a lens table that a format cannot carry at all
@@ -75,6 +78,37 @@ class AlreadyStored(StorageError):
             f"job {job_id} already has zoom {zoom:g}, focus {focus:g}, attempt {attempt}; "
             "measure it again as the next attempt"
         )
+
+
+class NameClash(StorageError):
+    """A table that does not fit those of its lens and camera. ``lens``, ``camera``, ``difference`` in words."""
+
+    def __init__(self, lens: str, camera: str, difference: str) -> None:
+        self.lens = lens
+        self.camera = camera
+        self.difference = difference
+        super().__init__(
+            f"{lens} on {camera} has tables of another picture: {difference}; "
+            "store this one under another camera's name, or ask for it all the same"
+        )
+
+
+class NotApproved(StorageError):
+    """The table is not the approved one of its lens. ``table_id``, ``approved_id`` of that one, None: there is none."""
+
+    def __init__(self, table_id: int, approved_id: int | None) -> None:
+        self.table_id = table_id
+        self.approved_id = approved_id
+        instead = "no table of its lens is" if approved_id is None else f"table {approved_id} is"
+        super().__init__(f"table {table_id} is not approved, {instead}; only the approved table can be rolled back")
+
+
+class NothingBefore(StorageError):
+    """No other table was approved before this one. ``table_id``."""
+
+    def __init__(self, table_id: int) -> None:
+        self.table_id = table_id
+        super().__init__(f"no other table was approved before table {table_id}; approve the one that is to be used")
 
 
 class TooLarge(StorageError):

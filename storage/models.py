@@ -109,7 +109,7 @@ class Event(SQLModel, table=True):
 
 
 class Table(SQLModel, table=True):
-    """A lens table. A job has at most one; an imported table has no job."""
+    """A lens table. A job has at most one; an imported table has no job. The database itself refuses a change."""
 
     __tablename__ = "tables"
     __table_args__ = (UniqueConstraint("lens_id", "version"),)
@@ -121,6 +121,23 @@ class Table(SQLModel, table=True):
     document: str = Field(sa_type=Text)
     job_id: str | None = Field(default=None, sa_type=Text, foreign_key="jobs.id", unique=True)
     sha256: str = Field(sa_type=Text)
+    provenance: str | None = Field(default=None, sa_type=Text)
+
+
+class TableAction(SQLModel, table=True):
+    """What was done with a lens table, by whom. Append-only: the database itself refuses a change."""
+
+    __tablename__ = "table_actions"
+    __table_args__ = (Index("actions_of_a_lens", "lens_id", "number"),)
+
+    number: int | None = Field(default=None, primary_key=True)
+    lens_id: int = Field(foreign_key="lenses.id")
+    table_id: int = Field(foreign_key="tables.id")
+    kind: str = Field(sa_type=Text)
+    replaces_id: int | None = Field(default=None, foreign_key="tables.id")
+    at: datetime = Field(sa_type=UtcText)
+    who: str | None = Field(default=None, sa_type=Text)
+    note: str | None = Field(default=None, sa_type=Text)
 
 
 class Picture(SQLModel, table=True):

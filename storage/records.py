@@ -8,7 +8,10 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from calibration.tables import LensTable, LevelResult
+from calibration.tables import LensTable, LevelResult, Provenance
+
+MAX_PAGE = 1000
+"""Most rows that one call gives back; a larger limit counts as this one."""
 
 EventDraft = tuple[str, Mapping[str, Any]]
 """An event yet to be numbered and dated: its kind and its data (JSON)."""
@@ -93,17 +96,55 @@ class EventRecord:
 
 @dataclass(frozen=True, slots=True)
 class LensRecord:
-    """A lens on a camera, and the newest version of its tables."""
+    """A lens on a camera, the newest version of its tables, and the table that is approved (None: none yet)."""
 
     id: int
     name: str
     camera: str
     latest_version: int
+    approved_table_id: int | None = None
+
+
+class TableAction(StrEnum):
+    """What was done with a stored table. A table's first action says how it came into the store."""
+
+    CALIBRATED = "calibrated"
+    """A job made it."""
+    IMPORTED = "imported"
+    CORRECTED = "corrected"
+    """It was made from another table of the store by a correction."""
+    APPROVED = "approved"
+    """It is the one to use from now on."""
+    ROLLED_BACK = "rolled_back"
+    """The same, because the one approved after it was taken back."""
+    PUBLISHED = "published"
+    """It was written to an engine."""
+
+
+APPROVALS = (TableAction.APPROVED, TableAction.ROLLED_BACK)
+"""The table of a lens's last one of these is approved."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActionRecord:
+    """An entry of the ledger of table actions. ``number`` orders those of all tables; ``version`` is the table's;
+    ``replaces_id``: the table that was approved until then; ``by``: who, as told."""
+
+    number: int
+    kind: TableAction
+    lens_id: int
+    table_id: int
+    version: int
+    replaces_id: int | None
+    at: datetime
+    by: str | None
+    note: str | None
 
 
 @dataclass(frozen=True, slots=True)
 class TableSummary:
-    """A stored lens table without its levels. ``sha256`` is that of its JSON export, in hexadecimal."""
+    """A stored lens table without its levels. ``sha256`` is that of its JSON export, in hexadecimal; ``approved``:
+    whether it was the approved one of its lens when this was read."""
 
     id: int
     lens_id: int
@@ -111,6 +152,8 @@ class TableSummary:
     created: datetime
     job_id: str | None
     sha256: str
+    approved: bool = False
+    provenance: Provenance | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,6 @@
-"""The ledger: jobs, their levels and events, lens tables, pictures. What it holds is the truth.
+"""The ledger: jobs, their levels and events, pictures, and the lens tables of :mod:`storage.table_store`.
+
+What it holds is the truth.
 
 Each method is one transaction. A level and its event are committed together; a committed level or event never
 changes. Every method may raise :class:`storage.errors.StorageBusy` (may be tried again), ``StorageFull``,
@@ -12,20 +14,18 @@ import os
 import uuid
 import zlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
 from datetime import datetime
 from types import TracebackType
 from typing import Any
 
-from sqlalchemy import func
 from sqlmodel import Session, col, select
 
-from calibration.tables import LensTable, LevelResult
+from calibration.tables import LevelResult
 from storage import models
 from storage.database import Database
 from storage.errors import AlreadyStored, EngineBusy, IdempotencyConflict, NotFound, TooLarge
-from storage.exports.json_table import write_json
 from storage.records import (
+    MAX_PAGE,
     RUNNING_STATES,
     UNFINISHED_STATES,
     EventDraft,
@@ -34,12 +34,9 @@ from storage.records import (
     JobPage,
     JobRecord,
     JobState,
-    LensRecord,
     LevelRecord,
     PictureKind,
     PictureRecord,
-    TableRecord,
-    TableSummary,
 )
 from storage.rows import (
     append_event,
@@ -47,17 +44,14 @@ from storage.rows import (
     find_job,
     find_picture,
     job_record,
-    lens_id_of,
     level_record,
-    require_lens,
+    page_limit,
     require_state,
     stored,
-    table_record,
-    table_rows,
-    table_summary,
     to_json,
 )
 from storage.schemas import level_to_document
+from storage.table_store import TableStore
 
 MAX_PICTURE_BYTES = 32 * 1024 * 1024
 """A lossless 8K picture of noise stays below it."""
@@ -65,16 +59,9 @@ MAX_PICTURE_BYTES = 32 * 1024 * 1024
 MAX_EVIDENCE_BYTES = 32 * 1024 * 1024
 """Packed; a level of 100 pictures with 1,000 points each stays below 8 MiB."""
 
-MAX_PAGE = 1000
-"""Most rows that one call gives back; a larger limit counts as this one."""
 
-
-class Repository:
+class Repository(TableStore):
     """The store as the app sees it. ``now`` gives the current time, aware; the repository reads no clock itself."""
-
-    def __init__(self, database: Database, now: Callable[[], datetime]) -> None:
-        self._database = database
-        self._now = now
 
     @classmethod
     async def open(cls, url_or_path: str | os.PathLike[str], now: Callable[[], datetime]) -> Repository:
@@ -193,7 +180,7 @@ class Repository:
     async def list_jobs(self, cursor: str | None = None, limit: int = 50) -> JobPage:
         """Jobs, newest first. ``cursor``: the ``next_cursor`` of the page before. Raises :class:`NotFound` for a cursor
         that was never given out."""
-        limit = _page_limit(limit)
+        limit = page_limit(limit)
 
         def work(session: Session) -> JobPage:
             query = select(models.Job).order_by(col(models.Job.number).desc()).limit(limit + 1)
@@ -323,7 +310,7 @@ class Repository:
 
     async def events_after(self, job_id: str, seq: int, limit: int = MAX_PAGE) -> list[EventRecord]:
         """The job's events with a higher seq than ``seq`` (0: from the first), in order. Raises :class:`NotFound`."""
-        limit = _page_limit(limit)
+        limit = page_limit(limit)
 
         def work(session: Session) -> list[EventRecord]:
             find_job(session, job_id)
@@ -334,7 +321,7 @@ class Repository:
 
     async def all_events_after(self, number: int, limit: int = MAX_PAGE) -> list[EventRecord]:
         """Events of all jobs with a higher ``number`` (0: from the first), in the order they were committed."""
-        limit = _page_limit(limit)
+        limit = page_limit(limit)
 
         def work(session: Session) -> list[EventRecord]:
             query = select(models.Event).where(col(models.Event.number) > number)
@@ -376,104 +363,3 @@ class Repository:
             return PictureRecord(picture.media_type, picture.data)
 
         return await self._database.read(work)
-
-    # Lens tables
-
-    async def save_table(self, job_id: str | None, table: LensTable, event: EventDraft | None = None) -> TableSummary:
-        """Store a table as the next version of its lens and camera, whatever version it says itself, with its event.
-
-        ``job_id`` None: an imported table (it then has no event). A job has one table: saving again, as after a
-        restart, gives the stored one back and appends nothing. Raises :class:`NotFound`.
-        """
-        now = self._now()
-
-        def work(session: Session) -> TableSummary:
-            job = None if job_id is None else find_job(session, job_id)
-            if job is not None:
-                earlier = session.exec(table_rows().where(models.Table.job_id == job_id)).one_or_none()
-                if earlier is not None:
-                    return table_summary(earlier)
-            lens_id = lens_id_of(session, table.lens, table.camera)
-            last = session.exec(select(func.max(models.Table.version)).where(models.Table.lens_id == lens_id)).one()
-            versioned = replace(table, version=1 + (last or 0))
-            document = write_json(versioned)
-            row = models.Table(
-                lens_id=lens_id,
-                version=versioned.version,
-                created=versioned.created,
-                document=document.decode(),
-                job_id=job_id,
-                sha256=hashlib.sha256(document).hexdigest(),
-            )
-            session.add(row)
-            session.flush()
-            if job is not None and event is not None:
-                append_event(session, job, event, now)
-            return table_summary(row)
-
-        return await self._database.write(work)
-
-    async def get_table(self, table_id: int) -> TableRecord:
-        """A stored table. Raises :class:`NotFound`."""
-
-        def work(session: Session) -> TableRecord:
-            row = session.get(models.Table, table_id)
-            if row is None:
-                raise NotFound("lens table", table_id)
-            return table_record(row)
-
-        return await self._database.read(work)
-
-    async def table_of_job(self, job_id: str) -> TableSummary | None:
-        """The table that a job made, None while it has none. Raises :class:`NotFound` for the job."""
-
-        def work(session: Session) -> TableSummary | None:
-            find_job(session, job_id)
-            row = session.exec(table_rows().where(models.Table.job_id == job_id)).one_or_none()
-            return None if row is None else table_summary(row)
-
-        return await self._database.read(work)
-
-    async def list_lenses(self) -> list[LensRecord]:
-        """Every lens and camera that has a table, by name."""
-
-        def work(session: Session) -> list[LensRecord]:
-            newest = func.max(models.Table.version)
-            query = (
-                select(models.Lens, newest)
-                .join(models.Table, col(models.Table.lens_id) == col(models.Lens.id))
-                .group_by(col(models.Lens.id))
-                .order_by(col(models.Lens.name), col(models.Lens.camera))
-            )
-            return [
-                LensRecord(stored(lens.id), lens.name, lens.camera, version) for lens, version in session.exec(query)
-            ]
-
-        return await self._database.read(work)
-
-    async def list_tables(self, lens_id: int) -> list[TableSummary]:
-        """The tables of a lens, newest first. Raises :class:`NotFound` for the lens."""
-
-        def work(session: Session) -> list[TableSummary]:
-            require_lens(session, lens_id)
-            query = table_rows().where(models.Table.lens_id == lens_id).order_by(col(models.Table.version).desc())
-            return [table_summary(row) for row in session.exec(query)]
-
-        return await self._database.read(work)
-
-    async def latest_table(self, lens_id: int) -> TableRecord:
-        """The newest table of a lens. Raises :class:`NotFound`."""
-
-        def work(session: Session) -> TableRecord:
-            require_lens(session, lens_id)
-            query = select(models.Table).where(models.Table.lens_id == lens_id)
-            row = session.exec(query.order_by(col(models.Table.version).desc())).first()
-            if row is None:
-                raise NotFound("lens table of lens", lens_id)
-            return table_record(row)
-
-        return await self._database.read(work)
-
-
-def _page_limit(limit: int) -> int:
-    return max(1, min(limit, MAX_PAGE))

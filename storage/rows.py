@@ -8,23 +8,33 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy.orm import defer
-from sqlmodel import Session, select
+from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import SelectOfScalar
 
+from calibration.tables import Provenance
 from storage import models
 from storage.errors import NotFound, StaleState
 from storage.exports.json_table import read_json
 from storage.records import (
+    APPROVALS,
+    MAX_PAGE,
+    ActionRecord,
     EventDraft,
     EventRecord,
     JobRecord,
     JobState,
     LevelRecord,
     PictureKind,
+    TableAction,
     TableRecord,
     TableSummary,
 )
-from storage.schemas import document_to_level
+from storage.schemas import ProvenanceDocument, document_to_level
+
+
+def page_limit(limit: int) -> int:
+    """How many rows a call gives back that was asked for ``limit``."""
+    return max(1, min(limit, MAX_PAGE))
 
 
 def to_json(value: Mapping[str, Any]) -> str:
@@ -118,11 +128,40 @@ def event_record(event: models.Event) -> EventRecord:
     return EventRecord(stored(event.number), event.job_id, event.seq, event.at, event.kind, json.loads(event.data))
 
 
-def table_summary(row: models.Table) -> TableSummary:
-    """A table's row as a summary."""
-    return TableSummary(stored(row.id), row.lens_id, row.version, row.created, row.job_id, row.sha256)
+def approved_table_id(session: Session, lens_id: int) -> int | None:
+    """The table of a lens that is approved: that of its last approval or roll back; None before the first."""
+    query = select(models.TableAction.table_id).where(
+        models.TableAction.lens_id == lens_id, col(models.TableAction.kind).in_([kind.value for kind in APPROVALS])
+    )
+    return session.exec(query.order_by(col(models.TableAction.number).desc())).first()
 
 
-def table_record(row: models.Table) -> TableRecord:
+def table_summary(row: models.Table, approved_id: int | None) -> TableSummary:
+    """A table's row as a summary; ``approved_id``: the approved table of its lens."""
+    provenance = None
+    if row.provenance is not None:
+        provenance = Provenance(**ProvenanceDocument.model_validate_json(row.provenance).model_dump())
+    table_id = stored(row.id)
+    return TableSummary(
+        table_id, row.lens_id, row.version, row.created, row.job_id, row.sha256, table_id == approved_id, provenance
+    )
+
+
+def table_record(row: models.Table, approved_id: int | None) -> TableRecord:
     """A table's row as a record."""
-    return TableRecord(table_summary(row), read_json(row.document.encode()))
+    return TableRecord(table_summary(row, approved_id), read_json(row.document.encode()))
+
+
+def action_record(row: models.TableAction, version: int) -> ActionRecord:
+    """An action's row as a record; ``version``: of its table."""
+    return ActionRecord(
+        number=stored(row.number),
+        kind=TableAction(row.kind),
+        lens_id=row.lens_id,
+        table_id=row.table_id,
+        version=version,
+        replaces_id=row.replaces_id,
+        at=row.at,
+        by=row.who,
+        note=row.note,
+    )

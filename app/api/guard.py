@@ -14,12 +14,15 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from app.api.context import PREFIX
 from app.api.errors import HARDENING, problem_response
 from app.settings import HOST_NAME, Settings
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _HOST = re.compile(rf"(?P<name>{HOST_NAME.pattern})(?::[0-9]{{1,5}})?")
 _HTTP_SCHEMES = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
+TABLES_PATH = f"{PREFIX}/tables"
+"""Where whole lens tables are sent to, which may be larger than other bodies."""
 Refusal = tuple[str, str]
 """Name of the problem, and its detail."""
 
@@ -32,6 +35,7 @@ class Guard:
         self._hosts = frozenset(settings.allowed_hosts)
         self._origins = frozenset(settings.allowed_origins)
         self._max_body_bytes = settings.max_body_bytes
+        self._max_table_bytes = settings.max_table_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -42,11 +46,12 @@ class Guard:
         if scope["type"] == "websocket":
             await self._socket(refusal, scope, receive, send)
             return
-        refusal = refusal or self._refuse_length(headers)
+        limit = self._max_table_bytes if scope["path"] == TABLES_PATH else self._max_body_bytes
+        refusal = refusal or _refuse_length(headers, limit)
         if refusal is not None:
             await problem_response(*refusal, scope["path"])(scope, receive, _with_headers(send))
             return
-        await self._app(scope, self._bounded(receive), _with_headers(send))
+        await self._app(scope, _bounded(receive, limit), _with_headers(send))
 
     async def _socket(self, refusal: Refusal | None, scope: Scope, receive: Receive, send: Send) -> None:
         if refusal is None:
@@ -85,29 +90,31 @@ class Guard:
             return "origin-refused", f"pages of {shown} may not do this; allow them with LENSMATCH_ALLOWED_ORIGINS"
         return None
 
-    def _refuse_length(self, headers: Headers) -> Refusal | None:
-        lengths = headers.getlist("content-length")
-        if not lengths:
-            return None
-        if len(lengths) > 1 or not (lengths[0].isascii() and lengths[0].isdigit() and len(lengths[0]) < 20):
-            return "bad-request", "the Content-Length header is no number; send one length in bytes"
-        if int(lengths[0]) > self._max_body_bytes:
-            return "body-too-large", f"the body has {lengths[0]} bytes, at most {self._max_body_bytes} are taken"
+
+def _refuse_length(headers: Headers, limit: int) -> Refusal | None:
+    lengths = headers.getlist("content-length")
+    if not lengths:
         return None
+    if len(lengths) > 1 or not (lengths[0].isascii() and lengths[0].isdigit() and len(lengths[0]) < 20):
+        return "bad-request", "the Content-Length header is no number; send one length in bytes"
+    if int(lengths[0]) > limit:
+        return "body-too-large", f"the body has {lengths[0]} bytes, at most {limit} are taken"
+    return None
 
-    def _bounded(self, receive: Receive) -> Receive:
-        taken = 0
 
-        async def bounded() -> Message:
-            nonlocal taken
-            message = await receive()
-            if message["type"] == "http.request":
-                taken += len(message.get("body", b""))
-                if taken > self._max_body_bytes:
-                    raise HTTPException(413, f"the body is larger than {self._max_body_bytes} bytes")
-            return message
+def _bounded(receive: Receive, limit: int) -> Receive:
+    taken = 0
 
-        return bounded
+    async def bounded() -> Message:
+        nonlocal taken
+        message = await receive()
+        if message["type"] == "http.request":
+            taken += len(message.get("body", b""))
+            if taken > limit:
+                raise HTTPException(413, f"the body is larger than {limit} bytes")
+        return message
+
+    return bounded
 
 
 def _with_headers(send: Send) -> Send:

@@ -16,7 +16,7 @@ from app.api.context import Context
 from app.api.errors import FieldError, Problem, responses
 from app.api.models import LensList, LensView, TableList, TableView
 from calibration.tables import LensTable
-from storage.exports import EXPORTS
+from storage.exports import EXPORTS, Export
 from storage.schemas import LensTableDocument
 
 router = APIRouter(tags=["lenses"])
@@ -42,7 +42,7 @@ async def list_tables(lens_id: Id, context: Context) -> TableList:
     responses={
         200: {"content": {export.media_type: {} for export in EXPORTS.values()}, "description": "the lens table"},
         304: {"description": "the client has it already"},
-        **responses("not-found", "invalid"),
+        **responses("not-found", "cannot-export", "invalid"),
     },
 )
 async def get_table(
@@ -55,15 +55,21 @@ async def get_table(
     ] = None,
 ) -> Response:
     """A lens table: JSON, or one of the export formats. A stored table never changes."""
-    export = EXPORTS.get(format or "json")
-    if export is None:
-        why = f"there is no format {format[:40] if format else ''!r}; there are {', '.join(EXPORTS)}"
-        raise Problem("invalid", f"query.format: {why}", errors=[FieldError(field="query.format", message=why)])
+    export = export_of(format or "json")
     record = await context.repository.get_table(table_id)
     tag = f'"{record.summary.sha256}"' if export.name == "json" else f'"{record.summary.sha256}-{export.name}"'
     body = await asyncio.to_thread(export.write, record.table)
     disposition = None if format is None else attachment(record.table, export.suffix)
     return tagged(request, tag, body, export.media_type, disposition)
+
+
+def export_of(name: str) -> Export:
+    """The export format of that name; a problem where there is none."""
+    export = EXPORTS.get(name)
+    if export is None:
+        why = f"there is no format {name[:40]!r}; there are {', '.join(EXPORTS)}"
+        raise Problem("invalid", f"query.format: {why}", errors=[FieldError(field="query.format", message=why)])
+    return export
 
 
 def attachment(table: LensTable, suffix: str) -> str:

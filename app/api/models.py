@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from typing import Any, Literal, Self
 
@@ -10,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.engines import EngineInfo
 from app.events import EventMessage
-from storage.records import JobRecord, JobState, LensRecord, LevelRecord, TableSummary
-from storage.schemas import LevelDocument, level_to_document
+from storage.records import ActionRecord, JobRecord, JobState, LensRecord, LevelRecord, TableAction, TableSummary
+from storage.schemas import LevelDocument, ProvenanceDocument, level_to_document
 
 
 class _View(BaseModel):
@@ -109,10 +110,17 @@ class LensView(_View):
     lens: str
     camera: str
     latest_version: int = Field(description="newest version of its tables")
+    approved_table_id: int | None = Field(description="the table that is approved; null: none yet")
 
     @classmethod
     def of(cls, lens: LensRecord) -> Self:
-        return cls(id=lens.id, lens=lens.name, camera=lens.camera, latest_version=lens.latest_version)
+        return cls(
+            id=lens.id,
+            lens=lens.name,
+            camera=lens.camera,
+            latest_version=lens.latest_version,
+            approved_table_id=lens.approved_table_id,
+        )
 
 
 class LensList(_View):
@@ -130,6 +138,8 @@ class TableView(_View):
     created: datetime
     job_id: str | None = Field(description="the job that made it; null: imported")
     sha256: str = Field(description="of its JSON document, hexadecimal")
+    approved: bool = Field(description="whether it is the approved one of its lens; at most one is")
+    provenance: ProvenanceDocument | None = Field(description="where it comes from; null: not kept")
 
     @classmethod
     def of(cls, table: TableSummary) -> Self:
@@ -140,6 +150,8 @@ class TableView(_View):
             created=table.created,
             job_id=table.job_id,
             sha256=table.sha256,
+            approved=table.approved,
+            provenance=None if table.provenance is None else ProvenanceDocument(**asdict(table.provenance)),
         )
 
 
@@ -147,6 +159,38 @@ class TableList(_View):
     """The tables of a lens, newest first."""
 
     tables: list[TableView]
+
+
+class ActionView(_View):
+    """Something that was done with a stored table."""
+
+    number: int = Field(description="orders the actions on all tables")
+    kind: TableAction
+    table_id: int
+    version: int = Field(description="of that table")
+    replaces_id: int | None = Field(description="the table that was approved until then")
+    at: datetime
+    by: str | None = Field(description="who, as told")
+    note: str | None
+
+    @classmethod
+    def of(cls, action: ActionRecord) -> Self:
+        return cls(
+            number=action.number,
+            kind=action.kind,
+            table_id=action.table_id,
+            version=action.version,
+            replaces_id=action.replaces_id,
+            at=action.at,
+            by=action.by,
+            note=action.note,
+        )
+
+
+class ActionList(_View):
+    """The history of a table, newest first."""
+
+    actions: list[ActionView]
 
 
 class EngineView(_View):

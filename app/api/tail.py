@@ -12,8 +12,8 @@ from collections import deque
 from dataclasses import dataclass
 
 from app.events import message
-from storage.records import EventRecord
-from storage.repository import MAX_PAGE, Repository
+from storage.records import MAX_PAGE, EventRecord
+from storage.repository import Repository
 
 KEPT_BYTES = 4 * 1024 * 1024
 """Thousands of usual events; a socket that is further behind reads the store by itself."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import hashlib
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -16,10 +18,12 @@ from app.cli.console import Show, WorkFailed, check_out, print_json, progress_ba
 from app.cli.tables import show_table
 from app.documents import PictureSet, read_picture_set
 from app.jobs.cpu import Cpu
+from app.jobs.provenance import provenance_of_set, sha256_of_all
 from app.picture_sets import SetLevel, calibrate_set, table_of
 from app.report import picture_set_report, write_report
 from app.settings import default_cpu_workers
 from calibration.tables import LensTable, LevelResult, LevelStatus
+from engine_adapters.errors import AdapterError
 from engine_adapters.folder import FolderPictures
 from storage.evidence import evidence_file, evidence_path, evidence_to_document
 from storage.exports import EXPORTS
@@ -79,6 +83,7 @@ async def _calibrate(
     described: PictureSet, folder: Path, method: Method, show: Show
 ) -> tuple[LensTable, list[SetLevel]]:
     cpu = Cpu(default_cpu_workers())
+    pictures_sha256 = None
     try:
         pictures = FolderPictures(folder)
         if method is Method.JOINT:
@@ -86,11 +91,23 @@ async def _calibrate(
         else:
             results = await calibrate_alternating(described, pictures, cpu, show)
             levels = [SetLevel(result, None, ()) for result in results]
+        if all(level.result.evidence is None for level in levels):
+            pictures_sha256 = await _pictures_sha256(described, pictures)
     finally:
         cpu.close()
     if not any(_is_measured(level.result) for level in levels):
         raise WorkFailed(_why_nothing(described, levels), [level.result for level in levels])
-    return replace(table_of(described, levels, utc_now()), method=method.value), levels
+    table = table_of(described, levels, utc_now())
+    return replace(table, method=method.value, provenance=provenance_of_set(table.levels, pictures_sha256)), levels
+
+
+async def _pictures_sha256(described: PictureSet, pictures: FolderPictures) -> str:
+    """Over the files of the set in its order, unreadable ones left out: for a method that keeps no evidence."""
+    hashes = []
+    for name in dict.fromkeys(picture.file for picture in described.pictures):
+        with contextlib.suppress(AdapterError):
+            hashes.append(hashlib.sha256((await pictures.read(name)).data).hexdigest())
+    return sha256_of_all(hashes)
 
 
 def _is_measured(result: LevelResult) -> bool:

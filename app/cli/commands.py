@@ -22,6 +22,7 @@ from app.cli.exports import export_table, import_table
 from app.cli.run import run
 from app.cli.serve import serve
 from app.cli.simulate import simulate
+from app.cli.versions import compare, tables
 
 _CALIBRATE = "Calibrate"
 _TABLES = "Lens tables"
@@ -103,6 +104,14 @@ cli.command(
         "lensmatch import table.csv --format csv", "lensmatch import table.csv --format csv --out table.json"
     ),
 )(import_table)
+cli.command(
+    rich_help_panel=_TABLES,
+    epilog=_examples("lensmatch compare before.json after.json", "lensmatch compare before.json after.json --json"),
+)(compare)
+cli.command(
+    rich_help_panel=_TABLES,
+    epilog=_examples("lensmatch tables", "lensmatch tables --database lensmatch-demo/lensmatch.db"),
+)(tables)
 cli.command(
     rich_help_panel=_STUDIO, epilog=_examples("lensmatch serve", "lensmatch serve --port 8080 --profile studio.toml")
 )(serve)

@@ -24,12 +24,17 @@ def build_settings(**given: Any) -> Settings:
         wrong_usage(f"setting {problem}; it comes from {source}")
 
 
+def chosen_profile(path: Path | None, settings: Settings) -> Path | None:
+    """The profile's file: the one given, else the first of the settings; None: the defaults."""
+    return path or next(iter(settings.profiles), None)
+
+
 def studio_profile(path: Path | None, settings: Settings) -> tuple[StudioProfile, str]:
     """The profile to use and where it is from: the file given, else the first of the settings, else the defaults.
 
     Raises :class:`engine_adapters.profile.ProfileError`.
     """
-    chosen = path or next(iter(settings.profiles), None)
+    chosen = chosen_profile(path, settings)
     if chosen is None:
         return StudioProfile(), "the default profile, an engine on this host"
     return load_profile(chosen), str(chosen)

@@ -10,6 +10,7 @@ import typer
 from app.cli.console import check_out, print_json, read_file, reported_errors, say, write_file, wrong_usage
 from app.cli.tables import show_table
 from app.documents import DocumentError
+from app.jobs.provenance import imported
 from calibration.tables import LensTable
 from storage.errors import BadDocument
 from storage.exports import EXPORTS, Export
@@ -31,7 +32,7 @@ def export_table(
     with reported_errors(as_json):
         export = _export(format_name)
         check_out(out)
-        read = _read(table, EXPORTS["json"])
+        read = read_table_file(table)
         write_file(out, export.write(read))
         if as_json:
             print_json({"out": str(out), "format": export.name, "cannot_carry": list(export.cannot_carry)})
@@ -51,7 +52,8 @@ def import_table(
     with reported_errors(as_json):
         export = _export(format_name)
         check_out(out)
-        table = _read(path, export)
+        data = read_file(path, MAX_DOCUMENT_BYTES)
+        table = imported(_parse(path, data, export), data, export)
         if out is not None:
             write_file(out, EXPORTS["json"].write(table))
         if as_json:
@@ -69,8 +71,12 @@ def _export(name: str) -> Export:
     return export
 
 
-def _read(path: Path, export: Export) -> LensTable:
-    data = read_file(path, MAX_DOCUMENT_BYTES)
+def read_table_file(path: Path) -> LensTable:
+    """The lens table in a JSON file. Raises :class:`app.documents.DocumentError` in one line."""
+    return _parse(path, read_file(path, MAX_DOCUMENT_BYTES), EXPORTS["json"])
+
+
+def _parse(path: Path, data: bytes, export: Export) -> LensTable:
     try:
         return export.read(data)
     except BadDocument as error:

@@ -62,6 +62,13 @@ _DOCUMENTS = {
     '"quality": {"score":, "contrast":, "fit_chi2":, "grid_rms_px":}, "seconds":}`, points row by row, `point_ids` '
     "which of the target's points each one is (a board may be partly hidden), `null` what is not told; or "
     '`{"found": false, "reason":, "error":}` with exit code 1',
+    "`compare`": '`{"first":, "second":, "verdict":, "agree":, "most_sigmas":, "difference_px": {"rms":, "max":}, '
+    '"worst": <level>, "levels": [{"zoom":, "focus":, "measured": [true, true], "difference_px":, "worst_px":, '
+    '"center_shift_px":, "f_ratio":, "sigma_px":, "sigmas":, "reason":}], "explanations": [{"cause":, '
+    '"center_shift_px":, "f_ratio":, "left_px":}], "map": {"zooms":, "focuses":, "rms_px":, "max_px":}}`, `null` what '
+    "is not told",
+    "`tables`": '`{"database":, "tables": [{"id":, "lens":, "camera":, "version":, "approved":, "created":, '
+    '"job_id":, "sha256":, "provenance":}]}`',
     "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from app.bootstrap import add_engine
-from app.cli.configuration import build_settings, studio_profile
+from app.bootstrap import DEFAULT_PROFILE, add_engine
+from app.cli.configuration import build_settings, chosen_profile, studio_profile
 from app.cli.console import (
     WorkFailed,
     check_out,
@@ -59,7 +59,14 @@ def run(
                 "run it in one, or name another head"
             )
         engines = Engines()
-        add_engine(engines, request.engine, profile, TerminalOperator().ask if by_hand else None)
+        chosen = chosen_profile(studio, settings)
+        add_engine(
+            engines,
+            request.engine,
+            profile,
+            TerminalOperator().ask if by_hand else None,
+            profile_name=DEFAULT_PROFILE if chosen is None else chosen.stem,
+        )
         with (progress_lines if by_hand else progress_bar)("run") as show:
             finished = asyncio.run(run_job(settings, engines, request, show))
         if out is not None:

@@ -82,7 +82,7 @@ def studio_engines(profile: StudioProfile, *, slow_pictures: bool = False) -> En
     """The simulated studio as the default engine."""
     engines = Engines()
     checked = parse_profile(profile_toml(profile), where="profile of the simulated studio")
-    add_engine(engines, DEFAULT_ENGINE, checked, slow_pictures=slow_pictures)
+    add_engine(engines, DEFAULT_ENGINE, checked, slow_pictures=slow_pictures, profile_name="simulated studio")
     return engines
 
 

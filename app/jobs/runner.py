@@ -39,6 +39,7 @@ from app.jobs.engine import learn
 from app.jobs.evidence import evidence_or_none
 from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
+from app.jobs.provenance import provenance_of_job
 from app.jobs.state import sources
 from app.jobs.sweep import level_task, order
 from app.jobs.taking import PictureTaker
@@ -407,6 +408,7 @@ class JobRunner:
             await self._fail(job_id, f"no level could be measured: {reasons[0]}")
             return
         reason = f"{len(failed)} of {len(results)} levels failed: {failed[0].reason}" if failed else None
+        levels = tuple(sorted(results, key=lambda r: (r.zoom, r.focus)))
         table = LensTable(
             lens=request.lens,
             camera=request.camera,
@@ -414,9 +416,10 @@ class JobRunner:
             created=self._now(),
             image_size=request.image_size,
             method=request.method,
-            levels=tuple(sorted(results, key=lambda r: (r.zoom, r.focus))),
+            levels=levels,
             sensor_mm=request.sensor_mm,
             pixel_aspect=request.pixel_aspect,
+            provenance=provenance_of_job(job_id, levels, self._engines.profile(request.engine)),
         )
         summary = await self._repository.save_table(job_id, table)
         await self._change(

@@ -26,7 +26,7 @@ from calibration.tables.parts import (
     Provenance,
     Sigma,
 )
-from calibration.tables.table import MAX_PICTURE_SIDE_PX, LensTable
+from calibration.tables.table import MAX_PICTURE_SIDE_PX, LensTable, other_picture
 
 __all__ = [
     "EVIDENCE_QUANTITIES",
@@ -48,4 +48,5 @@ __all__ = [
     "PixelError",
     "Provenance",
     "Sigma",
+    "other_picture",
 ]

@@ -19,6 +19,11 @@ _HW_TOLERANCE = (0.05, 0.005)
 # Relative (and for the distortion also absolute, radius 1 at half width) differences between a quantity and its twin
 # in other units. A person's rounding stays below them; another radius unit, picture width or axis does not.
 
+_SENSOR_TOLERANCE = 0.005
+_ASPECT_TOLERANCE = 1e-6
+# Relative. Data sheets round sensors to hundredths of a millimetre; two kinds of sensor differ by more. The pixel
+# aspect is known exactly.
+
 
 @dataclass(frozen=True, slots=True)
 class LensTable:
@@ -92,3 +97,21 @@ class LensTable:
     def level_at(self, zoom: float, focus: float) -> LevelResult | None:
         """The level with exactly these encoder values, None where there is none."""
         return next((level for level in self.levels if (level.zoom, level.focus) == (zoom, focus)), None)
+
+
+def other_picture(first: LensTable, second: LensTable) -> str | None:
+    """What of their pictures keeps two tables from describing one camera, in words; None where nothing does.
+
+    Their sizes in px and pixel aspects must be the same, and their sensors where both say them.
+    """
+    if first.image_size != second.image_size:
+        there, here = (f"{size[0]} x {size[1]} px" for size in (first.image_size, second.image_size))
+        return f"pictures of {there} there, of {here} here"
+    if not math.isclose(first.pixel_aspect, second.pixel_aspect, rel_tol=_ASPECT_TOLERANCE):
+        return f"pixel aspect {first.pixel_aspect:.9g} there, {second.pixel_aspect:.9g} here"
+    if first.sensor_mm is not None and second.sensor_mm is not None:
+        sides = zip(first.sensor_mm, second.sensor_mm, strict=True)
+        if not all(math.isclose(one, other, rel_tol=_SENSOR_TOLERANCE) for one, other in sides):
+            there, here = (f"{size[0]:g} x {size[1]:g} mm" for size in (first.sensor_mm, second.sensor_mm))
+            return f"a sensor of {there} there, of {here} here"
+    return None

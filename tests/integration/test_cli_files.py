@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli.commands import cli
+from app.jobs.provenance import inputs_sha256, sha256_of_all
 from benchmarks.pictures import draw_board, random_view
 from calibration.compare import overlay
 from calibration.lens import Lens
@@ -220,10 +223,28 @@ def test_both_methods_calibrate_rendered_pictures(method: str, shared_data: Path
     assert document == json.loads(out.read_bytes())
     (level,) = table.levels
     assert level.frames.real == 4
+    assert table.provenance is not None
+    assert (table.provenance.source, table.provenance.job_id) == ("calibrated", None)
+    files = [folder / name for name in dict.fromkeys(one["file"] for one in _set(folder)["pictures"])]
+    expected = inputs_sha256(table.levels) if method == "joint" else _sha256_of(files)
+    assert table.provenance.inputs_sha256 == expected is not None
     true = json.loads((folder / "truth.json").read_text("utf-8"))
     truth = _true_lens(true, table.image_size, table.pixel_aspect)
     assert overlay(truth, level.lens(table.image_size, table.pixel_aspect)).max_px < 0.3
     assert (tmp_path / "report.html").read_bytes().startswith(b"<!")
+
+
+def _set(folder: Path) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads((folder / "set.json").read_text("utf-8"))
+    return document
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _sha256_of(files: list[Path]) -> str:
+    return sha256_of_all(_hash(file.read_bytes()) for file in files)
 
 
 def _true_lens(true: dict[str, Any], image_size: tuple[int, int], pixel_aspect: float) -> Lens:
@@ -258,7 +279,11 @@ def test_a_table_goes_through_csv_and_back(repository: Path, tmp_path: Path) -> 
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["out"] == str(out)
     assert invoke("import", out, "--format", "csv", "--out", back).exit_code == 0
-    assert EXPORTS["json"].read(back.read_bytes()) == table
+    read = EXPORTS["json"].read(back.read_bytes())
+    assert replace(read, provenance=table.provenance) == table
+    assert read.provenance is not None
+    assert (read.provenance.source, read.provenance.inputs_sha256) == ("imported", _hash(out.read_bytes()))
+    assert read.provenance.parent_sha256 == _hash(EXPORTS["json"].write(table))
     printed = invoke("import", out, "--format", "csv", "--json")
     assert json.loads(printed.stdout) == json.loads(back.read_bytes())
     shown = invoke("import", out, "--format", "csv")

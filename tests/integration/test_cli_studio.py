@@ -117,7 +117,10 @@ async def test_doctor_and_run_on_a_studio_that_is_in_order(lensmatch: Any, folde
         assert done.returncode == 0, done.stderr
         document = json.loads(done.stdout)
         assert document == json.loads((folder / "table.json").read_text("utf-8"))
-        (level,) = EXPORTS["json"].read((folder / "table.json").read_bytes()).levels
+        table = EXPORTS["json"].read((folder / "table.json").read_bytes())
+        assert table.provenance is not None
+        assert (table.provenance.source, table.provenance.profile) == ("calibrated", "studio")
+        (level,) = table.levels
         assert overlay(true_lens(LENS, 0.5, 0.25), level.lens(LENS.image_size)).max_px < 0.15
         assert "run 100%" in done.stderr
         assert (folder / "report.html").stat().st_size > 10_000

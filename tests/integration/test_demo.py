@@ -28,6 +28,8 @@ async def test_the_demo_tells_its_table_beside_the_truth_and_leaves_its_files(le
     assert {"lens-table.json", "lens-table.csv", "report.html"} <= files.keys()
     table = EXPORTS["json"].read(files["lens-table.json"].read_bytes())
     assert json.loads(files["lens-table.json"].read_bytes()) == told["table"]
+    assert table.provenance is not None
+    assert (table.provenance.source, table.provenance.profile) == ("calibrated", "simulated studio")
     assert EXPORTS["csv"].read(files["lens-table.csv"].read_bytes()) == table
     report = files["report.html"].read_text("utf-8")
     assert "truth" in report

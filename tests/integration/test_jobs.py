@@ -17,9 +17,11 @@ from app.documents import JobRequest
 from app.engines import StudioMismatch, UnknownEngine
 from app.errors import QueueFull
 from app.events import TERMINAL_KINDS, JobQueued, draft
+from app.jobs.provenance import inputs_sha256
 from app.settings import Settings
 from calibration.compare import overlay
 from calibration.tables import LevelStatus
+from engine_adapters.profile import profile_sha256
 from engine_adapters.r3.client import R3Engine
 from engine_adapters.sim.launch import launched_studio
 from engine_adapters.sim.lens_truth import embedded_lens_names, load_embedded, parse_lens
@@ -103,6 +105,12 @@ async def test_a_job_measures_its_levels_and_leaves_the_engine_as_it_was(tmp_pat
         summary = await b.service.repository.table_of_job(record.id)
         assert summary is not None
         table = (await b.service.repository.get_table(summary.id)).table
+        assert summary.provenance == table.provenance is not None
+        assert (table.provenance.source, table.provenance.job_id) == ("calibrated", record.id)
+        assert table.provenance.software.startswith("lensmatch ")
+        assert table.provenance.profile == "simulated studio"
+        assert table.provenance.profile_sha256 == profile_sha256(studio_profile(b.addresses, LENS))
+        assert table.provenance.inputs_sha256 == inputs_sha256(table.levels) is not None
         assert [(level.zoom, level.focus) for level in table.levels] == sorted(levels)
         for level in table.levels:
             assert level.status is LevelStatus.OK

@@ -15,14 +15,18 @@ from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlmodel import Session, SQLModel
 
-from calibration.tables import LevelResult
+from calibration.tables import LevelResult, Provenance
 from storage.database import MIGRATIONS, Database
 from storage.errors import DatabaseUnusable, NotFound
+from storage.exports.json_table import write_json
 from storage.records import JobState
 from storage.repository import Repository
+from tests.support.service import lens_table
 
 MOMENT = datetime(2026, 11, 21, 10, 0, 0, tzinfo=UTC)
 
@@ -31,8 +35,8 @@ NEXT = '''
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0003"
-down_revision = "0002"
+revision = "tomorrow"
+down_revision = "{newest}"
 
 
 def upgrade():
@@ -41,6 +45,15 @@ def upgrade():
     op.execute("INSERT INTO heads (id) VALUES (1)")
     {end}
 '''
+
+
+def newest_revision() -> str:
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    return str(ScriptDirectory.from_config(config).get_current_head())
+
+
+NEWEST = newest_revision()
 
 
 def now() -> datetime:
@@ -62,7 +75,8 @@ async def job_id(path: Path) -> str:
 def newer_migrations(folder: Path, end: str = "") -> Path:
     copy = folder / "migrations"
     shutil.copytree(MIGRATIONS, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "versions" / "r0003_next.py").write_text(NEXT.replace("{end}", end), encoding="utf-8")
+    step = NEXT.replace("{newest}", NEWEST).replace("{end}", end)
+    (copy / "versions" / "tomorrow.py").write_text(step, encoding="utf-8")
     return copy
 
 
@@ -97,15 +111,15 @@ async def test_two_processes_may_make_the_database_at_once(path: Path) -> None:
     opened = await asyncio.gather(*(Repository.open(path, now) for _ in range(4)))
     for repository in opened:
         await repository.close()
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [(NEWEST,)]
 
 
 async def test_an_upgrade_keeps_the_rows_and_a_backup_of_before(path: Path, job_id: str, tmp_path: Path) -> None:
     database = await Database.open(path, now, newer_migrations(tmp_path))
     await database.close()
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0003",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [("tomorrow",)]
     assert rows(path, "SELECT id, priority FROM jobs") == [(job_id, 5)]
-    assert backups(path) == ["lensmatch.backup-0002-20261121T100000Z.db"]
+    assert backups(path) == [f"lensmatch.backup-{NEWEST}-20261121T100000Z.db"]
     async with await Repository.open(path.with_name(backups(path)[0]), now) as repository:
         assert (await repository.get_job(job_id)).lens == "XA 20x"
 
@@ -138,30 +152,34 @@ async def test_a_killed_upgrade_leaves_the_old_database(
 
 
 async def test_no_backup_no_upgrade(path: Path, job_id: str, tmp_path: Path) -> None:
-    (tmp_path / "lensmatch.backup-0002-20261121T100000Z.db.unfinished").mkdir()
+    (tmp_path / f"lensmatch.backup-{NEWEST}-20261121T100000Z.db.unfinished").mkdir()
     migrations = newer_migrations(tmp_path)
     with pytest.raises(DatabaseUnusable, match="cannot be opened for writing"):
         await Database.open(path, now, migrations)
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [(NEWEST,)]
     assert rows(path, "SELECT id FROM jobs") == [(job_id,)]
 
 
 async def test_a_database_of_a_newer_version_is_left_alone(path: Path, job_id: str, tmp_path: Path) -> None:
     database = await Database.open(path, now, newer_migrations(tmp_path))
     await database.close()
-    with pytest.raises(DatabaseUnusable, match=r"newer version of Lensmatch \(schema 0003, .*; update Lensmatch"):
+    with pytest.raises(DatabaseUnusable, match=r"newer version of Lensmatch \(schema tomorrow, .*; update Lensmatch"):
         await Repository.open(path, now)
     assert rows(path, "SELECT id, priority FROM jobs") == [(job_id, 5)]
 
 
-def first_schema(folder: Path) -> Path:
-    copy = folder / "first"
-    shutil.copytree(MIGRATIONS, copy, ignore=shutil.ignore_patterns("__pycache__", "r0002*"))
+def schema_of(folder: Path, newest: str) -> Path:
+    """The migrations up to revision ``newest``, those of after left out."""
+    copy = folder / newest
+    shutil.copytree(MIGRATIONS, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    for step in (copy / "versions").glob("r*.py"):
+        if step.name > f"r{newest}~":
+            step.unlink()
     return copy
 
 
 async def test_a_database_of_the_first_release_gets_a_place_for_evidence(path: Path, tmp_path: Path) -> None:
-    before = await Database.open(path, now, first_schema(tmp_path))
+    before = await Database.open(path, now, schema_of(tmp_path, "0001"))
     await before.close()
     assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
     result = LevelResult.failed(0.0, 0.5, "dark")
@@ -178,14 +196,18 @@ async def test_a_database_of_the_first_release_gets_a_place_for_evidence(path: P
     assert backups(path) == ["lensmatch.backup-0001-20261121T100000Z.db"]
 
 
-async def test_killed_half_way_the_first_release_is_still_there_and_is_then_upgraded(
-    path: Path, tmp_path: Path, repository: Path
+@pytest.mark.parametrize(
+    ("before_it", "file", "table"),
+    [("0001", "r0002_evidence.py", "evidence"), ("0002", "r0003_table_actions.py", "table_actions")],
+)
+async def test_killed_half_way_the_release_before_is_still_there_and_is_then_upgraded(
+    path: Path, tmp_path: Path, repository: Path, before_it: str, file: str, table: str
 ) -> None:
-    before = await Database.open(path, now, first_schema(tmp_path))
+    before = await Database.open(path, now, schema_of(tmp_path, before_it))
     await before.close()
     deadly = tmp_path / "deadly"
     shutil.copytree(MIGRATIONS, deadly, ignore=shutil.ignore_patterns("__pycache__"))
-    step = deadly / "versions" / "r0002_evidence.py"
+    step = deadly / "versions" / file
     step.write_text(step.read_text("utf-8") + "    __import__('os')._exit(9)\n", "utf-8")
     script = (
         "import asyncio, sys; from datetime import UTC, datetime; from pathlib import Path; "
@@ -195,8 +217,47 @@ async def test_killed_half_way_the_first_release_is_still_there_and_is_then_upgr
     command = [sys.executable, "-c", script, str(path), str(deadly)]
     killed = await asyncio.to_thread(subprocess.run, command, cwd=repository, check=False, timeout=60)
     assert killed.returncode == 9
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0001",)]
-    assert rows(path, "SELECT name FROM sqlite_master WHERE name = 'evidence'") == []
+    assert rows(path, "SELECT version_num FROM alembic_version") == [(before_it,)]
+    assert rows(path, f"SELECT name FROM sqlite_master WHERE name = '{table}'") == []
     async with await Repository.open(path, now) as ledger:
         await ledger.check()
-    assert rows(path, "SELECT version_num FROM alembic_version") == [("0002",)]
+    assert rows(path, "SELECT version_num FROM alembic_version") == [(NEWEST,)]
+
+
+async def test_tables_of_before_the_ledger_of_actions_are_kept_and_can_be_approved(path: Path, tmp_path: Path) -> None:
+    before = await Database.open(path, now, schema_of(tmp_path, "0002"))
+    await before.close()
+    told = replace(lens_table(), provenance=Provenance("calibrated", "lensmatch 0.1.0", note="é"))
+    documents = [write_json(told), write_json(replace(lens_table(), version=2))]
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("INSERT INTO lenses (id, name, camera) VALUES (1, 'XA 20x', 'Cam0')")
+        for version, document in enumerate(documents, start=1):
+            connection.execute(
+                "INSERT INTO tables (lens_id, version, created, document, sha256) VALUES (1, ?, ?, ?, ?)",
+                (version, "2026-11-21T10:00:00.000000Z", document.decode(), hashlib.sha256(document).hexdigest()),
+            )
+    async with await Repository.open(path, now) as repository:
+        second, first = await repository.list_tables(1)
+        assert (first.provenance, second.provenance) == (told.provenance, None)
+        assert (await repository.get_table(first.id)).table == told
+        assert [first.approved, second.approved, *await repository.table_history(1)] == [False, False]
+        assert (await repository.approve_table(first.id)).approved
+        assert [table.approved for table in await repository.list_tables(1)] == [False, True]
+        assert (await repository.save_table(None, lens_table())).version == 3
+    assert rows(path, "SELECT sha256 FROM tables WHERE id < 3") == [
+        (hashlib.sha256(document).hexdigest(),) for document in documents
+    ]
+    assert backups(path) == ["lensmatch.backup-0002-20261121T100000Z.db"]
+
+
+async def test_a_damaged_table_of_before_does_not_keep_the_database_from_opening(path: Path, tmp_path: Path) -> None:
+    before = await Database.open(path, now, schema_of(tmp_path, "0002"))
+    await before.close()
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("INSERT INTO lenses (id, name, camera) VALUES (1, 'XA 20x', 'Cam0')")
+        connection.execute(
+            "INSERT INTO tables (lens_id, version, created, document, sha256) VALUES (1, 1, '', '{', '')"
+        )
+    async with await Repository.open(path, now) as repository:
+        assert [lens.name for lens in await repository.list_lenses()] == ["XA 20x"]
+    assert rows(path, "SELECT document, provenance FROM tables") == [("{", None)]

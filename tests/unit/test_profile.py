@@ -21,6 +21,7 @@ from engine_adapters.profile import (
     TrackingSettings,
     load_profile,
     parse_profile,
+    profile_sha256,
     profile_toml,
     require_available,
 )
@@ -48,6 +49,16 @@ def test_the_text_reads_back_to_the_same_profile() -> None:
     for profile in (StudioProfile(), changed):
         assert parse_profile(profile_toml(profile)) == profile
         tomllib.loads(profile_toml(profile))
+
+
+def test_the_hash_of_a_profile_is_of_what_it_says_not_of_how_it_is_written() -> None:
+    bare = parse_profile("")
+    assert profile_sha256(bare) == profile_sha256(parse_profile(profile_toml())) == profile_sha256(StudioProfile())
+    ordered = parse_profile("[r3]\nport = 9010\nhost = 'a'\n[picture]\npixel_aspect = 1.1")
+    turned = parse_profile("picture = {pixel_aspect = 1.1}\nr3 = {host = 'a', port = 9010}")
+    assert profile_sha256(ordered) == profile_sha256(turned)
+    changed = parse_profile("[r3]\nport = 9011\nhost = 'a'\n[picture]\npixel_aspect = 1.1")
+    assert len({profile_sha256(one) for one in (bare, ordered, changed)}) == 3
 
 
 def test_every_key_stands_in_the_text_under_a_comment() -> None:
