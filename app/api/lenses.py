@@ -42,7 +42,7 @@ async def list_tables(lens_id: Id, context: Context) -> TableList:
     responses={
         200: {"content": {export.media_type: {} for export in EXPORTS.values()}, "description": "the lens table"},
         304: {"description": "the client has it already"},
-        **responses("not-found", "invalid"),
+        **responses("not-found", "invalid", "cannot-export"),
     },
 )
 async def get_table(

@@ -33,10 +33,14 @@ def export_table(
         check_out(out)
         read = _read(table, EXPORTS["json"])
         write_file(out, export.write(read))
+        remarks = export.remarks(read) if export.remarks is not None else ()
         if as_json:
-            print_json({"out": str(out), "format": export.name, "cannot_carry": list(export.cannot_carry)})
+            lost = list(export.cannot_carry)
+            print_json({"out": str(out), "format": export.name, "cannot_carry": lost, "remarks": list(remarks)})
         else:
             say(f"{export.title}: {out}, {len(read.levels)} levels")
+            for remark in remarks:
+                say(remark)
             for what in export.cannot_carry:
                 say(f"not in this format: {what}")
 
