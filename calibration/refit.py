@@ -178,7 +178,11 @@ def _polynomial(terms: Iterable[float]) -> Polynomial:
 
 
 def _scaled(terms: Iterable[float], unit: float) -> tuple[float, ...]:
-    return tuple(float(term) * unit ** (2 * n) for n, term in enumerate(terms, start=1))
+    """Each term times unit^(2n); infinite, not an error, where that is beyond numbers."""
+    with np.errstate(over="ignore"):
+        return tuple(
+            float(term * np.float64(unit) ** (2 * n)) if term else 0.0 for n, term in enumerate(terms, start=1)
+        )
 
 
 def _has_root_to_1(polynomial: Polynomial) -> bool:

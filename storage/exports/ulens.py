@@ -269,6 +269,10 @@ def _tables(read: tuple[_Table, ...]) -> dict[str, _Rows]:
             here, there = ("has", "lacks") if more else ("lacks", "has")
             why = f"{here} focus {focus:g}, zoom {zoom:g}, which FocalLengthTable {there}"
             raise BadDocument(name, why, "give every table the same levels")
+    for key, values in tables["FocalLengthTable"].items():
+        if min(values) <= 0:
+            why = f"focus {key[0]:g}, zoom {key[1]:g} has Fx {values[0]:g}, Fy {values[1]:g}; both must be positive"
+            raise BadDocument("FocalLengthTable", why, _AGAIN)
     for key, values in tables["DistortionTable"].items():
         if any(values[2:]):
             why = f"focus {key[0]:g}, zoom {key[1]:g} has K3, P1 or P2, which this lens model lacks"
