@@ -165,3 +165,24 @@ def test_terms_that_make_a_pole_are_passed_over() -> None:
             assert "pole or fold" in str(error)  # noqa: PT017 either outcome is right
     inverse, left = best_inverse(near_fold, TERMS, 0.0)
     assert (left.max_px, (len(inverse.numerator), len(inverse.denominator))) == min(sound)
+
+
+@pytest.mark.parametrize("terms", [2, 3])
+def test_the_fit_is_least_squares_of_the_picture_over_the_disc(terms: int) -> None:
+    """Any small change of a coefficient makes the area-weighted error in the picture larger."""
+    r_d = np.linspace(0, CENTRED.corner_radius(), 257)[1:]
+    on_axis = np.stack([r_d, 0 * r_d], axis=-1)
+    r_u = CENTRED.undistort(on_axis)[:, 0]
+    step = 1e-6
+    slope = (CENTRED.distort(np.stack([r_u + step, 0 * r_u], axis=-1))[:, 0] - r_d) / step
+
+    def squares(inverse: InverseRadial) -> float:
+        return float(np.sum(r_d * (slope * (inverse.undistort_radius(r_d) - r_u)) ** 2))
+
+    found = fit_inverse(CENTRED, terms)
+    least = squares(found)
+    for index in range(terms):
+        for factor in (0.9995, 1.0005):
+            changed = list(found.numerator)
+            changed[index] *= factor
+            assert squares(InverseRadial(tuple(changed))) > least
