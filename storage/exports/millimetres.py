@@ -79,10 +79,10 @@ def refit_note(refits: Sequence[Overlay]) -> str | None:
     return f"k1, k2 refitted from a distorted-to-undistorted map, off by at most rms {rms:.2g}, max {largest:.2g} px"
 
 
-def refit_remarks(refits: Iterable[tuple[LevelResult, Overlay]]) -> tuple[str, ...]:
+def refit_advice(refits: Iterable[tuple[LevelResult, Overlay]]) -> str:
     """What the operator is told of levels written by refit: how far the worst one is off."""
     told = list(refits)
     worst, left = max(told, key=lambda refit: refit[1].max_px)
     where = f"zoom {worst.zoom:g}, focus {worst.focus:g}"
     text = f"refitted from distorted to undistorted: off by rms {left.rms_px:.2g}, max {left.max_px:.2g} px at {where}"
-    return (text + (", and no more elsewhere; the file states each level's" if len(told) > 1 else ""),)
+    return text + (", and no more elsewhere; the file states each level's" if len(told) > 1 else "")

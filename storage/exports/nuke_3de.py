@@ -53,8 +53,8 @@ from storage.exports.millimetres import (
     degraded_by,
     exact_sensor_mm,
     pixel_aspect_of,
+    refit_advice,
     refit_note,
-    refit_remarks,
     refitted_lens,
     unfolded_lens,
 )
@@ -136,8 +136,8 @@ class _Node:
 
 def write_nuke(table: LensTable) -> bytes:
     """The table as a Nuke script. Raises :class:`CannotExport`."""
-    sensor_mm = exact_sensor_mm(table, _CARRIER)
     levels = lens_levels(table)
+    sensor_mm = exact_sensor_mm(table, _CARRIER)
     lines = [_TABLE_NOTE + note_text(head_of(table))]
     for number, level in enumerate(levels, start=1):
         lens = unfolded_lens(table, level)
@@ -165,9 +165,9 @@ def read_nuke(data: bytes) -> LensTable:
     return noted_table(data, _CARRIER, head, [_own_level(node, head) for node in ours])
 
 
-def remarks(table: LensTable) -> tuple[str, ...]:
+def advice(table: LensTable) -> str:
     """How exact the refits are. Raises :class:`CannotExport`."""
-    return refit_remarks((level, _refit(unfolded_lens(table, level), level)[1]) for level in lens_levels(table))
+    return refit_advice((level, _refit(unfolded_lens(table, level), level)[1]) for level in lens_levels(table))
 
 
 def _refit(lens: Lens, level: LevelResult) -> tuple[InverseRadial, Overlay]:
@@ -369,5 +369,5 @@ NUKE_3DE = Export(
         EVIDENCE_LOST,
         "k1 and k2 themselves, zoom, focus and nodal offset, but for comments that Nuke drops when it saves",
     ),
-    remarks=remarks,
+    advice=advice,
 )

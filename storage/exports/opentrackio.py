@@ -58,8 +58,8 @@ from storage.exports.millimetres import (
     degraded_by,
     exact_sensor_mm,
     pixel_aspect_of,
+    refit_advice,
     refit_note,
-    refit_remarks,
     refitted_lens,
     unfolded_lens,
 )
@@ -82,8 +82,9 @@ _ASPECT_TOLERANCE = 1e-6
 
 def write_opentrackio(table: LensTable, model: str = UD) -> bytes:
     """The table as a JSON array of samples in one of the two models. Raises :class:`CannotExport`."""
+    levels = lens_levels(table)
     sensor_mm = exact_sensor_mm(table, _CARRIER)
-    samples = [_sample(table, level, sensor_mm, model) for level in lens_levels(table)]
+    samples = [_sample(table, level, sensor_mm, model) for level in levels]
     return json.dumps(samples, indent=1, ensure_ascii=False, allow_nan=False).encode("utf-8") + b"\n"
 
 
@@ -118,9 +119,9 @@ def read_opentrackio(data: bytes) -> LensTable:
     )
 
 
-def remarks_du(table: LensTable) -> tuple[str, ...]:
+def advice_du(table: LensTable) -> str:
     """How exact the refit of :data:`DU` is. Raises :class:`CannotExport`."""
-    return refit_remarks((level, _refit(unfolded_lens(table, level), level)[1]) for level in lens_levels(table))
+    return refit_advice((level, _refit(unfolded_lens(table, level), level)[1]) for level in lens_levels(table))
 
 
 def _sample(table: LensTable, level: LevelResult, sensor_mm: tuple[float, float], model: str) -> dict[str, Any]:
@@ -343,5 +344,5 @@ OPENTRACKIO_DU = Export(
     write=partial(write_opentrackio, model=DU),
     read=read_opentrackio,
     cannot_carry=(*_NOT_CARRIED, "k1 and k2 themselves: they are refitted there and back"),
-    remarks=remarks_du,
+    advice=advice_du,
 )

@@ -128,8 +128,8 @@ class _LensFile(_Part):
 
 def write_ulens(table: LensTable) -> bytes:
     """The table as a lens file. Raises :class:`CannotExport`."""
-    sensor_mm = exact_sensor_mm(table, _CARRIER)
     levels = lens_levels(table)
+    sensor_mm = exact_sensor_mm(table, _CARRIER)
     facts = {**provenance_of(table), _TABLE_NOTE: note_text(head_of(table))}
     entries = [{"name": name, "value": value} for name, value in facts.items()]
     entries += [{"name": _LEVEL_NOTE, "value": note_text(mark_of(level))} for level in levels]
@@ -346,12 +346,12 @@ def _pixel_aspect(aspects: dict[_Key, float], head: Head | None) -> float:
     return aspect
 
 
-def _remarks(table: LensTable) -> tuple[str, ...]:
+def _advice(table: LensTable) -> str:
+    told = "Tz is the nodal offset from the pivot, cm: the tracking must tell the pivot's pose"
     untold = [level for level in lens_levels(table) if level.nodal_offset_mm is None]
-    told: tuple[str, ...] = ("Tz is the nodal offset from the pivot, cm: the tracking must tell the pivot's pose",)
     if untold:
-        where = f"zoom {untold[0].zoom:g}, focus {untold[0].focus:g}"
-        told += (f"no nodal offset at {where}" + (f" and {len(untold) - 1} more levels" if len(untold) > 1 else ""),)
+        told += f"; no nodal offset at zoom {untold[0].zoom:g}, focus {untold[0].focus:g}"
+        told += f" and {len(untold) - 1} more levels" if len(untold) > 1 else ""
     return told
 
 
@@ -363,5 +363,5 @@ ULENS = Export(
     write=write_ulens,
     read=read_ulens,
     cannot_carry=(EVIDENCE_LOST, "k1, k2 or centre shift that are not told, but for a note: they stand as 0"),
-    remarks=_remarks,
+    advice=_advice,
 )

@@ -273,7 +273,7 @@ def test_what_a_format_does_to_a_table_is_said(repository: Path, tmp_path: Path)
     assert "not in this format: k1 and k2 themselves" in said
     told = json.loads(invoke("export", golden, "--format", "opentrackio-du", "--out", out, "--json").stdout)
     assert "entrancePupilOffset" in told["cannot_carry"][1]
-    assert "max 0.00047 px at zoom 0, focus 0.5" in told["remarks"][0]
+    assert "max 0.00047 px at zoom 0, focus 0.5" in told["advice"][0]
 
 
 def test_bad_tables_are_one_line_and_leave_nothing(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from calibration.tables import LensTable, LevelResult, LevelStatus
 from storage.errors import BadDocument, CannotExport
 from storage.exports import EXPORTS
 from storage.exports.nuke_3de import read_nuke, write_nuke
-from tests.support.lens_tables import SIZE, VECTOR, assert_same_lenses, level_of, real_tables, table_of, vector_table
+from tests.support.real_lenses import SIZE, VECTOR, assert_same_lenses, level_of, real_tables, table_of, vector_table
 
 NUKE = EXPORTS["nuke-3de"]
 
@@ -100,9 +100,8 @@ def test_the_nodes_own_equation_is_off_by_what_its_label_says() -> None:
 
 
 def test_the_refit_is_told_to_the_operator() -> None:
-    assert NUKE.remarks is not None
-    (remark,) = NUKE.remarks(two_levels())
-    assert "rms 0.52, max 1.6 px at zoom 0, focus 0.5, and no more elsewhere" in remark
+    assert NUKE.advice is not None
+    assert "rms 0.52, max 1.6 px at zoom 0, focus 0.5, and no more elsewhere" in NUKE.advice(two_levels())
 
 
 # There and back

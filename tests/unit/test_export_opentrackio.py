@@ -18,7 +18,7 @@ from calibration.lens import Lens
 from calibration.tables import LensTable, LevelResult, LevelStatus
 from storage.errors import BadDocument, CannotExport
 from storage.exports import EXPORTS, Export
-from tests.support.lens_tables import (
+from tests.support.real_lenses import (
     SENSOR_MM,
     SIZE,
     VECTOR,
@@ -125,10 +125,9 @@ def test_the_pupil_is_not_told_from_the_wrong_place() -> None:
 
 
 def test_the_refit_is_told_to_the_operator() -> None:
-    assert DU.remarks is not None
-    (remark,) = DU.remarks(vector_table())
-    assert "max 0.00047 px at zoom 0, focus 0.5" in remark
-    assert UD.remarks is None
+    assert DU.advice is not None
+    assert "max 0.00047 px at zoom 0, focus 0.5" in DU.advice(vector_table())
+    assert UD.advice is None
 
 
 # The standard's own schema and examples

@@ -17,7 +17,7 @@ from calibration.tables import LensTable, LevelResult
 from storage.errors import BadDocument, CannotExport
 from storage.exports import EXPORTS
 from storage.exports.ulens import read_ulens, write_ulens
-from tests.support.lens_tables import SIZE, VECTOR, assert_same_lenses, level_of, real_tables, table_of, vector_table
+from tests.support.real_lenses import SIZE, VECTOR, assert_same_lenses, level_of, real_tables, table_of, vector_table
 
 ULENS = EXPORTS["ulens"]
 Document = dict[str, Any]
@@ -138,8 +138,8 @@ def test_a_file_of_another_program_is_read() -> None:
 def test_a_level_without_nodal_offset_has_no_row_and_is_told() -> None:
     table = table_of(level_of(VECTOR), level_of(VECTOR, 0.5, untold=("nodal_offset_mm",)))
     assert len(rows(document_of(table), "NodalOffsetTable")) == 1
-    assert ULENS.remarks is not None
-    assert ULENS.remarks(table)[1] == "no nodal offset at zoom 0.5, focus 0.5"
+    assert ULENS.advice is not None
+    assert ULENS.advice(table).endswith("; no nodal offset at zoom 0.5, focus 0.5")
     assert [level.nodal_offset_mm for level in read(document_of(table)).levels] == [pytest.approx(121.3), None]
     none = table_of(level_of(VECTOR, untold=("nodal_offset_mm",)))
     assert table_named(document_of(none), "NodalOffsetTable")["data"] == ""

@@ -15,7 +15,7 @@ from calibration.compare import overlay
 from calibration.errors import FoldedLens, InvalidInput, NotConverged
 from calibration.lens import Lens
 from calibration.refit import InverseRadial, best_inverse, fit_inverse, inverse_overlay, refit_lens
-from tests.support.lens_tables import SENSOR_MM, SIZE, VECTOR, real_lenses
+from tests.support.real_lenses import SENSOR_MM, SIZE, VECTOR, real_lenses
 
 TERMS = ((1, 0), (1, 1), (2, 1), (2, 2), (3, 2), (3, 3))
 F_MM = 9.199
