@@ -313,7 +313,7 @@ def document_to_table(document: object) -> tables.LensTable:
         raise BadDocument(
             "lens_table", f"is version {found}, this program reads {SCHEMA_VERSION}", "use a newer version of it"
         )
-    read = _validated(LensTableDocument, document)
+    read = validated(LensTableDocument, document)
     levels = tuple(
         _level(level, read.image_size, read.pixel_aspect, f"levels[{index}]") for index, level in enumerate(read.levels)
     )
@@ -343,7 +343,7 @@ def document_to_level(
     document: object, image_size: tuple[int, int] | None = None, pixel_aspect: float = 1.0
 ) -> tables.LevelResult:
     """One level of its JSON object; without ``image_size`` nothing that is left out is filled in."""
-    return _level(_validated(LevelDocument, document), image_size, pixel_aspect, "level")
+    return _level(validated(LevelDocument, document), image_size, pixel_aspect, "level")
 
 
 def _level(
@@ -382,7 +382,8 @@ _PLAIN_FIELDS = (
 )
 
 
-def _validated(model: type[_Model], document: object) -> _Model:
+def validated(model: type[_Model], document: object, place: str = "") -> _Model:
+    """A part of a document, checked; ``place``: where it stands. Raises :class:`BadDocument`, naming the field."""
     try:
         return model.model_validate(document)
     except ValidationError as error:
@@ -394,11 +395,10 @@ def _validated(model: type[_Model], document: object) -> _Model:
         why = first["msg"][:1].lower() + first["msg"][1:]
         if first["type"] != "missing":
             why += f", not {_shown(first['input'])}"
-        raise BadDocument(_place(first["loc"]), why + more, _REPAIR) from error
+        raise BadDocument(_place(first["loc"], place), why + more, _REPAIR) from error
 
 
-def _place(location: Iterable[int | str]) -> str:
-    place = ""
+def _place(location: Iterable[int | str], place: str = "") -> str:
     for part in location:
         place += f"[{part}]" if isinstance(part, int) else f".{part}" if place else part
     return place

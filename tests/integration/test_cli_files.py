@@ -290,6 +290,17 @@ def test_a_table_goes_through_csv_and_back(repository: Path, tmp_path: Path) -> 
     assert table.lens in shown.stdout
 
 
+def test_what_a_format_does_to_a_table_is_said(repository: Path, tmp_path: Path) -> None:
+    golden = repository / "tests" / "golden" / "lens_table.json"
+    out = tmp_path / "t.nk"
+    said = invoke("export", golden, "--format", "nuke-3de", "--out", out).stderr
+    assert "max 1.6 px at zoom 0, focus 0.5" in said
+    assert "not in this format: k1 and k2 themselves" in said
+    told = json.loads(invoke("export", golden, "--format", "opentrackio-du", "--out", out, "--json").stdout)
+    assert "entrancePupilOffset" in told["cannot_carry"][1]
+    assert "max 0.00047 px at zoom 0, focus 0.5" in told["advice"][0]
+
+
 def test_bad_tables_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     bad = tmp_path / "bad.json"
