@@ -7,9 +7,25 @@ cannot carry at all; ``read`` raises :class:`storage.errors.BadDocument`, naming
 from __future__ import annotations
 
 from storage.exports.base import Export
+from storage.exports.colmap import COLMAP
 from storage.exports.csv_table import CSV_TABLE
+from storage.exports.gyroflow import GYROFLOW
 from storage.exports.json_table import JSON_TABLE
+from storage.exports.lensfun import LENSFUN
+from storage.exports.opencv_yaml import OPENCV_YAML
+from storage.exports.r3_commands import R3_COMMANDS
 
-EXPORTS: dict[str, Export] = {export.name: export for export in (JSON_TABLE, CSV_TABLE)}
+EXPORTS: dict[str, Export] = {
+    export.name: export
+    for export in (
+        JSON_TABLE,
+        CSV_TABLE,
+        OPENCV_YAML,
+        COLMAP,
+        GYROFLOW,
+        LENSFUN,
+        R3_COMMANDS,
+    )
+}
 
 __all__ = ["EXPORTS", "Export"]
