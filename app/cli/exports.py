@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +12,9 @@ from app.cli.console import check_out, print_json, read_file, reported_errors, s
 from app.cli.tables import show_table
 from app.documents import DocumentError
 from calibration.tables import LensTable
-from storage.errors import BadDocument
+from storage.errors import BadDocument, CannotExport
 from storage.exports import EXPORTS, Export
-from storage.exports.base import MAX_DOCUMENT_BYTES
+from storage.exports.base import lens_levels
 from storage.schemas import table_to_document
 
 _FORMATS = ", ".join(EXPORTS)
@@ -25,33 +26,55 @@ def export_table(
     table: Annotated[Path, typer.Argument(metavar="TABLE.json", help="lens table")],
     format_name: Format,
     out: Annotated[Path, typer.Option(help="file to write")],
+    zoom: Annotated[float | None, typer.Option(help="only this zoom; with --focus the lens at that place")] = None,
+    focus: Annotated[float | None, typer.Option(help="only this focus")] = None,
+    overscan: Annotated[
+        float | None,
+        typer.Option(metavar="FACTOR", help="ST maps: size of the undistorted picture over the camera's, 1 to 2"),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a lens table in another format. What the format cannot hold is said, not dropped in silence."""
     with reported_errors(as_json):
         export = _export(format_name)
+        if overscan is not None and export.write_overscan is None:
+            wrong_usage(f"--overscan is for ST maps; {export.name} has none")
         check_out(out)
-        read = _read(table, EXPORTS["json"])
-        write_file(out, export.write(read))
-        if as_json:
-            print_json({"out": str(out), "format": export.name, "cannot_carry": list(export.cannot_carry)})
+        read = _part(_read(table, EXPORTS["json"]), zoom, focus)
+        if overscan is not None and export.write_overscan is not None:
+            write_file(out, export.write_overscan(read, overscan))
         else:
-            say(f"{export.title}: {out}, {len(read.levels)} levels")
+            write_file(out, export.write(read))
+        advice = [export.advice(read)] if export.advice else []
+        if as_json:
+            told = {"out": str(out), "format": export.name, "cannot_carry": list(export.cannot_carry)}
+            print_json(told | ({"advice": advice} if advice else {}))
+        else:
+            levels = lens_levels(read) if export.cannot_carry else read.levels
+            say(f"{export.title}: {out}, {len(levels)} of {len(read.levels)} levels")
             for what in export.cannot_carry:
                 say(f"not in this format: {what}")
+            for line in advice:
+                say(line)
 
 
 def import_table(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="file to read")],
     format_name: Format,
     out: Annotated[Path | None, typer.Option(help="lens table (JSON) to write; without it, it is shown")] = None,
+    fov_x: Annotated[
+        float | None,
+        typer.Option(metavar="DEGREES", help="field of view across, for a file that does not tell it (ST maps)"),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Read a lens table from another format, check it, and show it or write it as JSON."""
     with reported_errors(as_json):
         export = _export(format_name)
+        if fov_x is not None and export.read_with_fov is None:
+            wrong_usage(f"--fov-x is for ST maps; {export.name} tells the field of view")
         check_out(out)
-        table = _read(path, export)
+        table = _read(path, export, fov_x)
         if out is not None:
             write_file(out, EXPORTS["json"].write(table))
         if as_json:
@@ -69,9 +92,34 @@ def _export(name: str) -> Export:
     return export
 
 
-def _read(path: Path, export: Export) -> LensTable:
-    data = read_file(path, MAX_DOCUMENT_BYTES)
+def _part(table: LensTable, zoom: float | None, focus: float | None) -> LensTable:
+    """The levels of this zoom and of this focus; with both, the lens at that place."""
+    if zoom is not None and focus is not None:
+        return _at(table, zoom, focus)
+    levels = tuple(level for level in table.levels if zoom in (None, level.zoom) and focus in (None, level.focus))
+    if not levels:
+        what, values = ("focus", {level.focus for level in table.levels})
+        if zoom is not None:
+            what, values = ("zoom", {level.zoom for level in table.levels})
+        told = ", ".join(f"{value:g}" for value in sorted(values)[:20])
+        raise CannotExport(f"no level has this {what}; the table has {what} {told}")
+    return replace(table, levels=levels)
+
+
+def _at(table: LensTable, zoom: float, focus: float) -> LensTable:
+    """The table of one level, the lens at this place."""
+    level = table.level_at(zoom, focus)
+    if level is None:
+        told = ", ".join(f"{level.zoom:g} / {level.focus:g}" for level in table.levels[:20])
+        raise CannotExport(f"no level has zoom {zoom:g}, focus {focus:g}; the table has zoom / focus {told}")
+    return replace(table, levels=(level,))
+
+
+def _read(path: Path, export: Export, fov_x_deg: float | None = None) -> LensTable:
+    data = read_file(path, export.max_bytes)
     try:
+        if fov_x_deg is not None and export.read_with_fov is not None:
+            return export.read_with_fov(data, fov_x_deg)
         return export.read(data)
     except BadDocument as error:
         raise DocumentError(f"{path}: {error}") from error

@@ -14,6 +14,7 @@ from storage.exports.json_table import JSON_TABLE
 from storage.exports.lensfun import LENSFUN
 from storage.exports.opencv_yaml import OPENCV_YAML
 from storage.exports.r3_commands import R3_COMMANDS
+from storage.exports.stmap import STMAP
 
 EXPORTS: dict[str, Export] = {
     export.name: export
@@ -25,6 +26,7 @@ EXPORTS: dict[str, Export] = {
         GYROFLOW,
         LENSFUN,
         R3_COMMANDS,
+        STMAP,
     )
 }
 

@@ -39,6 +39,7 @@ class Export:
 
     ``max_bytes``: the largest file that is read. ``write_overscan``: ``write`` with an overscan factor (1: none), where
     the format has one. ``read_with_fov``: ``read`` of a file that does not tell the field of view, with ``fov_x_deg``.
+    ``advice``: what to tell the operator beside the file.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Export:
     max_bytes: int = MAX_DOCUMENT_BYTES
     write_overscan: Callable[[LensTable, float], bytes] | None = None
     read_with_fov: Callable[[bytes, float], LensTable] | None = None
+    advice: Callable[[LensTable], str] | None = None
 
 
 def decode_text(data: bytes) -> str:
@@ -146,11 +148,13 @@ def read_table(
         raise BadDocument("", str(error), "correct it, or export it again") from error
 
 
-class _Note(BaseModel):
+class Note(BaseModel):
+    """Facts that a format has no field for, in a place of the file that other programs skip."""
+
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class Head(_Note):
+class Head(Note):
     """What a format notes of the table as a whole, beside its own fields."""
 
     lens_table: Literal[1]
@@ -167,7 +171,7 @@ class Head(_Note):
     software: Name = "unknown"
 
 
-class Mark(_Note):
+class Mark(Note):
     """What a format notes of a level, beside its own fields. ``untold``: quantities that the level does not tell and
     the format's own fields show as 0."""
 
@@ -178,7 +182,7 @@ class Mark(_Note):
     degraded: Annotated[str, Field(strict=True, min_length=1, max_length=_REASON_CHARS)] | None = None
 
 
-_N = TypeVar("_N", bound=_Note)
+_N = TypeVar("_N", bound=Note)
 
 
 def head_of(table: LensTable) -> dict[str, Any]:
@@ -215,7 +219,7 @@ def note_text(facts: Mapping[str, Any]) -> str:
 
 
 def read_note(kind: type[_N], found: object, place: str) -> _N:
-    """A :class:`Head` or :class:`Mark` of a file, as JSON text or what came out of it. Raises :class:`BadDocument`."""
+    """A note of a file, as JSON text or what came out of it. Raises :class:`BadDocument`."""
     facts = parse_json(found, place) if isinstance(found, str) else found
     try:
         return kind.model_validate(facts)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from calibration.lens import Lens
-from calibration.tables import LensTable
+from calibration.tables import LensTable, LevelResult
 from storage.errors import BadDocument
 from storage.exports.base import (
     EVIDENCE_LOST,
@@ -62,10 +62,10 @@ def write_colmap(table: LensTable) -> bytes:
         lens = level.lens(table.image_size, table.pixel_aspect)
         cx, cy = (value + _HALF_PIXEL for value in lens.principal_point_px)
         if lens.pixel_aspect == 1:
-            model, params = "RADIAL", (lens.f_px, cx, cy, lens.k1, lens.k2)
+            model, params = "RADIAL", [lens.f_px, cx, cy, lens.k1, lens.k2]
         else:
             model = "OPENCV"
-            params = (lens.f_px, lens.pixel_aspect * lens.f_px, cx, cy, lens.k1, lens.k2, 0.0, 0.0)
+            params = [lens.f_px, lens.pixel_aspect * lens.f_px, cx, cy, lens.k1, lens.k2, 0.0, 0.0]
         lines.append(f"{_LEVEL}{note_text(mark_of(level))}")
         lines.append(f"{number} {model} {width} {height} {' '.join(repr(float(value)) for value in params)}")
     return ("\n".join(lines) + "\n").encode("ascii")
@@ -75,7 +75,9 @@ def read_colmap(data: bytes) -> LensTable:
     """The table of our own file, or of the only camera of another's. Raises :class:`BadDocument`."""
     head: Head | None = None
     mark: Mark | None = None
-    levels, lenses, ids = [], [], set()
+    levels: list[LevelResult] = []
+    lenses: list[Lens] = []
+    ids: set[str] = set()
     for number, line in enumerate(decode_text(data).splitlines(), start=1):
         place, text = f"line {number}", line.strip()
         if text.startswith(_HEAD):

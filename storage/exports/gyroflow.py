@@ -53,7 +53,7 @@ def write_gyroflow(table: LensTable) -> bytes:
     keys = [f"{level.zoom:.{_KEY_DIGITS}f}" for level in levels]
     if len(set(keys)) != len(keys):
         raise CannotExport(
-            "two levels have zooms that Gyroflow cannot tell apart (6 decimals); export one of them (--zoom)"
+            "two levels have zooms alike to six decimals, Gyroflow cannot tell them apart; export one (--zoom)"
         )
     width, height = table.image_size
     size = {"w": width, "h": height}
@@ -124,12 +124,11 @@ def read_gyroflow(data: bytes) -> LensTable:
     if size != head.image_size:
         raise BadDocument("calib_dimension", "contradicts lensmatch.table.image_size", "export it again")
     marks = [read_note(Mark, entry, f"lensmatch.levels[{n}]") for n, entry in enumerate(note["levels"])]
+    entries: Any = profile.get("interpolations")
     if len(marks) == 1:
         entries = {f"{marks[0].zoom:.{_KEY_DIGITS}f}": profile["fisheye_params"]}
-    else:
-        entries = profile.get("interpolations")
-        if not isinstance(entries, dict) or len(entries) != len(marks):
-            raise BadDocument("interpolations", f"must hold {len(marks)} levels", "export it again")
+    elif not isinstance(entries, dict) or len(entries) != len(marks):
+        raise BadDocument("interpolations", f"must hold {len(marks)} levels", "export it again")
     levels = []
     for mark in marks:
         key = f"{mark.zoom:.{_KEY_DIGITS}f}"
@@ -149,8 +148,8 @@ def _foreign(data: bytes, profile: dict[str, Any], size: tuple[int, int]) -> Len
 
 
 def _size(found: Any) -> tuple[int, int]:
-    sides = [found.get("w"), found.get("h")] if isinstance(found, dict) else []
-    if len(sides) != 2 or not all(isinstance(side, int) and 2 <= side <= MAX_PICTURE_SIDE_PX for side in sides):
+    sides: list[Any] = [found.get("w"), found.get("h")] if isinstance(found, dict) else []
+    if not sides or not all(isinstance(side, int) and 2 <= side <= MAX_PICTURE_SIDE_PX for side in sides):
         raise BadDocument("calib_dimension", f"must be w and h of 2 to {MAX_PICTURE_SIDE_PX} px", _ADVICE)
     return sides[0], sides[1]
 
@@ -161,12 +160,8 @@ def _lens(
     """The lens of an entry; the pixel aspect as known, else from the matrix."""
     entry = entry if isinstance(entry, dict) else {}
     matrix = _numbers(entry.get("camera_matrix"), f"{place}.camera_matrix")
-    if (
-        len(matrix) != 9
-        or matrix[0] <= 0
-        or matrix[4] <= 0
-        or (matrix[1], *matrix[3:4], *matrix[6:]) != (0, 0, 0, 0, 1)
-    ):
+    rest = [value for place_in_it, value in enumerate(matrix) if place_in_it not in (0, 2, 4, 5)]
+    if rest != [0, 0, 0, 0, 1] or matrix[0] <= 0 or matrix[4] <= 0:
         raise BadDocument(f"{place}.camera_matrix", "is not [fx 0 cx, 0 fy cy, 0 0 1]", _ADVICE)
     coefficients = _numbers(entry.get("distortion_coeffs"), f"{place}.distortion_coeffs")
     if len(coefficients) < 2 or any(coefficients[2:]):
@@ -182,7 +177,7 @@ def _lens(
 def _numbers(found: Any, place: str) -> list[float]:
     """A list of numbers, or of lists of them, as a flat list."""
     rows = found if isinstance(found, list) else [None]
-    flat = [value for row in rows for value in (row if isinstance(row, list) else [row])]
+    flat: list[Any] = [value for row in rows for value in (row if isinstance(row, list) else [row])]
     if not all(isinstance(value, (int, float)) and abs(value) < math.inf for value in flat):
         raise BadDocument(place, "must be a list of finite numbers", _ADVICE)
     return [float(value) for value in flat]

@@ -1,10 +1,10 @@
 """lensfun's XML: distortion model ``poly5``, one entry a focal length.
 
-``r_d = r_u (1 + k1' r_u^2 + k2' r_u^4)`` with radius 1 at half of the picture's short side, h px: with the focal length
-f px, k1' = k1 (h / f)^2 and k2' = k2 (h / f)^4. Lengths are in mm, so the table must know its sensor's width; its height
-is what square pixels make of it. ``real-focal`` is the focal length F = f sensor width / W, crop factor the diagonal of
-24 x 36 mm over the sensor's. lensfun 0.3.4 measures a picture between its outer pixel centres (W - 1), later ones
-between its edges: these coefficients are for the edges.
+``r_d = r_u (1 + k1' r_u^2 + k2' r_u^4)`` with radius 1 at half of the picture's short side, h px: with the focal
+length f px, k1' = k1 (h / f)^2 and k2' = k2 (h / f)^4. Lengths are in mm, so the table must know its sensor's width;
+its height is what square pixels make of it. ``real-focal`` is the focal length F = f sensor width / W, crop factor the
+diagonal of 24 x 36 mm over the sensor's. lensfun 0.3.4 measures a picture between its outer pixel centres (W - 1),
+later ones between its edges: these coefficients are for the edges.
 
 lensfun has no place for the centre shift, focus, encoder values, and pixels that are not square. Comments, which
 lensfun skips, hold them as JSON, so that our own reader gets them back. Files without these comments are refused: they
@@ -120,7 +120,7 @@ def read_lensfun(data: bytes) -> LensTable:
     calibrations = lenses[0].findall("calibration")
     if len(calibrations) != 1:
         raise BadDocument("calibration", f"is there {len(calibrations)} times, not once", "remove the others")
-    levels = []
+    levels: list[LevelResult] = []
     mark: _Mark | None = None
     for child in calibrations[0]:
         place = f"level {len(levels)}"
@@ -154,7 +154,8 @@ def _parse(data: bytes) -> Element:
 
 def _note(element: Element, kind: str) -> str | None:
     """The JSON of a comment of this kind, None for anything else."""
-    text = (element.text or "").strip() if element.tag is Comment else ""
+    tag: object = element.tag  # a comment has the function that makes comments as its tag
+    text = (element.text or "").strip() if tag is Comment else ""
     return text.removeprefix(kind) if text.startswith(kind) else None
 
 

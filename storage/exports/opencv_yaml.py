@@ -1,9 +1,9 @@
 """OpenCV's YAML (``cv2.FileStorage``): camera matrix and distortion coefficients of each level.
 
 The convention is the product's own: pixel centres at whole numbers, k1 and k2 in focal-length units, undistorted to
-distorted, ``distortion_coefficients`` = k1, k2, p1, p2, k3 with p1 = p2 = k3 = 0. ``levels`` is a sequence of maps with
-``zoom``, ``focus``, ``camera_matrix``, ``distortion_coefficients`` and, where known, ``nodal_offset_mm``. A table of one
-level also has the usual keys at the top, so that any reader of a single calibration takes it.
+distorted, ``distortion_coefficients`` = k1, k2, p1, p2, k3 with p1 = p2 = k3 = 0. ``levels`` is a sequence of maps
+with ``zoom``, ``focus``, ``camera_matrix``, ``distortion_coefficients`` and, where known, ``nodal_offset_mm``. A table
+of one level also has the usual keys at the top, so that any reader of a single calibration takes it.
 
 Also read: the calibration of a single camera by another program (``camera_matrix``, ``distortion_coefficients``, the
 picture's size, under their usual names), as zoom 0, focus 0.

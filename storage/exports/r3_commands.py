@@ -1,6 +1,6 @@
 """Command lines for R3, the render engine: one MultiExport a level, in a text file.
 
-Each level has a line that begins with ``scene``, exactly as the engine's text socket takes it, with the scene and export
+Each level has a line that begins with ``scene``, as the engine's text socket takes it, with the scene and export
 names of a studio profile's defaults and the values in the product's own conventions (degrees, px, mm, k1 and k2 in
 focal-length units). For an engine of other names or conventions, publish the table with its studio profile instead.
 A level with ``engine_values`` sets those: they are what makes this engine show the lens.
