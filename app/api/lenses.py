@@ -11,11 +11,12 @@ from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
 from starlette.responses import Response
 
-from app.api.answers import tagged
+from app.api.answers import tagged, unchanged
 from app.api.context import Context
 from app.api.errors import FieldError, Problem, responses
 from app.api.models import LensList, LensView, TableList, TableView
 from calibration.tables import LensTable
+from storage.errors import CannotExport
 from storage.exports import EXPORTS
 from storage.schemas import LensTableDocument
 
@@ -61,7 +62,14 @@ async def get_table(
         raise Problem("invalid", f"query.format: {why}", errors=[FieldError(field="query.format", message=why)])
     record = await context.repository.get_table(table_id)
     tag = f'"{record.summary.sha256}"' if export.name == "json" else f'"{record.summary.sha256}-{export.name}"'
-    body = await asyncio.to_thread(export.write, record.table)
+    if unchanged(request, tag):  # before the work: ST maps take seconds
+        return tagged(request, tag, b"", export.media_type)
+    try:
+        body = await asyncio.to_thread(export.write, record.table)
+    except CannotExport as error:
+        raise Problem(
+            "invalid", f"query.format: {error}", errors=[FieldError(field="query.format", message=str(error))]
+        ) from error
     disposition = None if format is None else attachment(record.table, export.suffix)
     return tagged(request, tag, body, export.media_type, disposition)
 

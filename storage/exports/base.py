@@ -203,14 +203,13 @@ def mark_of(level: LevelResult) -> dict[str, Any]:
     if untold := [name for name in ("k1", "k2", "center_shift_px") if getattr(level, name) is None]:
         facts["untold"] = untold
     if level.status is LevelStatus.DEGRADED and level.reason:
-        facts["degraded"] = _one_line(level.reason) or "no reason is kept"
+        facts["degraded"] = _one_line(level.reason)
     return facts
 
 
 def _one_line(text: str) -> str:
     """At most 200 characters that can stand in any file."""
-    plain = "".join(character if character.isprintable() else " " for character in text)
-    return plain.strip()[:_REASON_CHARS].strip()
+    return "".join(character if character.isprintable() else " " for character in text)[:_REASON_CHARS]
 
 
 def note_text(facts: Mapping[str, Any]) -> str:

@@ -2,9 +2,10 @@
 
 ``r_d = r_u (1 + k1' r_u^2 + k2' r_u^4)`` with radius 1 at half of the picture's short side, h px: with the focal
 length f px, k1' = k1 (h / f)^2 and k2' = k2 (h / f)^4. Lengths are in mm, so the table must know its sensor's width;
-its height is what square pixels make of it. ``real-focal`` is the focal length F = f sensor width / W, crop factor the
-diagonal of 24 x 36 mm over the sensor's. lensfun 0.3.4 measures a picture between its outer pixel centres (W - 1),
-later ones between its edges: these coefficients are for the edges.
+its height is what square pixels make of it. ``focal`` is the focal length F = f sensor width / W, crop factor the
+diagonal of 24 x 36 mm over the sensor's. (``real-focal`` is left out: with poly5 it is the focal length anyway, and
+lensfun 0.3.4 refuses a file that has it.) lensfun 0.3.4 measures a picture's diagonal between its outer pixel
+centres, later versions between its edges: these coefficients are for the edges.
 
 lensfun has no place for the centre shift, focus, encoder values, and pixels that are not square. Comments, which
 lensfun skips, hold them as JSON, so that our own reader gets them back. Files without these comments are refused: they
@@ -79,7 +80,7 @@ def write_lensfun(table: LensTable) -> bytes:
         k1, k2 = lens.k1 * unit**2, lens.k2 * unit**4
         entries.append(f"            <!-- {_LEVEL}{note_text(mark)} -->")
         entries.append(
-            f'            <distortion model="{_MODEL}" focal="{focal_mm!r}" real-focal="{focal_mm!r}" '
+            f'            <distortion model="{_MODEL}" focal="{focal_mm!r}" '
             f'k1="{k1!r}" k2="{k2!r}"/>'
         )
     lens_name, camera_name = escape(table.lens), escape(table.camera)
@@ -163,15 +164,15 @@ def _level(entry: Element, mark: _Mark, head: Head, sensor_width_mm: float, plac
     numbers: dict[str, float] = {}
     if entry.get("model") != _MODEL:
         raise BadDocument(place, f"has the model {str(entry.get('model'))[:20]}, not {_MODEL}", _ADVICE)
-    for name in ("real-focal", "k1", "k2"):
+    for name in ("focal", "k1", "k2"):
         try:
             numbers[name] = float(entry.get(name, "0"))
         except ValueError as error:
             raise BadDocument(f"{place}, {name}", "is no number", _ADVICE) from error
     width, height = head.image_size
-    f_px = numbers["real-focal"] * width / sensor_width_mm
+    f_px = numbers["focal"] * width / sensor_width_mm
     if not 0 < f_px < math.inf:
-        raise BadDocument(f"{place}, real-focal", "must be a positive number of mm", _ADVICE)
+        raise BadDocument(f"{place}, focal", "must be a positive number of mm", _ADVICE)
     unit = min(width, height) / 2 / f_px
     told: dict[str, Any] = {"nodal_offset_mm": mark.nodal_offset_mm}
     if mark.center_shift_px is not None:

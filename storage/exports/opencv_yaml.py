@@ -92,6 +92,9 @@ def _put(file: cv2.FileStorage, name: str, value: Any) -> None:
         for part in value:
             _put(file, "", part)
         file.endWriteStruct()
+    elif isinstance(value, str):
+        # In quotes of our own: cv2 takes a text that begins and ends with a quote for one that has them already.
+        file.write(name, '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"')
     else:
         file.write(name, value)
 

@@ -74,7 +74,14 @@ def lens_table(lens: str = "XA 20x") -> LensTable:
     """A table of one measured and one failed level."""
     created = datetime(2026, 11, 21, 10, tzinfo=UTC)
     return LensTable(
-        lens, "Cam0", 1, created, SIZE, "joint", (measured_level(), LevelResult.failed(1.0, 0.5, "no board"))
+        lens,
+        "Cam0",
+        1,
+        created,
+        SIZE,
+        "joint",
+        (measured_level(), LevelResult.failed(1.0, 0.5, "no board")),
+        sensor_mm=(9.59, 5.39),
     )
 
 
