@@ -62,7 +62,7 @@ _DOCUMENTS = {
     '"quality": {"score":, "contrast":, "fit_chi2":, "grid_rms_px":}, "seconds":}`, points row by row, `point_ids` '
     "which of the target's points each one is (a board may be partly hidden), `null` what is not told; or "
     '`{"found": false, "reason":, "error":}` with exit code 1',
-    "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
+    "`export`": '`{"out":, "format":, "cannot_carry": [...]}`, for ST maps also `"advice": [...]`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "
     "`survey`, when it is ready; with or without `--json`",

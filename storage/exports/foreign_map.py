@@ -19,8 +19,8 @@ from storage.errors import BadDocument
 from storage.exports.map_picture import MapPicture
 
 FITS_PX = 0.05
-"""Largest RMS (per coordinate) of a map that is said to be of this lens model; rounding leaves a thousandth."""
-_CLEARER = 3.0
+"""Largest RMS (per coordinate) of a map that is said to be of this lens model; rounding leaves 2e-5 at 1080p."""
+_CLEARER, _ROUNDING_PX = 5.0, 1e-4
 _GRID = (48, 27)
 _LEAST_POINTS = 50
 
@@ -72,7 +72,7 @@ def fit_map(picture: MapPicture, place: str) -> MapFit:
             f"is not a lens of k1 and k2: {fits[0].rms_px:.3g} px RMS are left",
             "use a map without overscan, margins or other terms",
         )
-    if fits[1].rms_px < _CLEARER * fits[0].rms_px or fits[1].rms_px < FITS_PX / _CLEARER:
+    if fits[1].rms_px < _CLEARER * max(fits[0].rms_px, _ROUNDING_PX):
         raise BadDocument(
             place, "moves its pixels too little to show which way it goes", "take the coefficients from their source"
         )

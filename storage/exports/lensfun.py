@@ -79,10 +79,7 @@ def write_lensfun(table: LensTable) -> bytes:
             mark["center_shift_px"] = list(level.center_shift_px)
         k1, k2 = lens.k1 * unit**2, lens.k2 * unit**4
         entries.append(f"            <!-- {_LEVEL}{note_text(mark)} -->")
-        entries.append(
-            f'            <distortion model="{_MODEL}" focal="{focal_mm!r}" '
-            f'k1="{k1!r}" k2="{k2!r}"/>'
-        )
+        entries.append(f'            <distortion model="{_MODEL}" focal="{focal_mm!r}" k1="{k1!r}" k2="{k2!r}"/>')
     lens_name, camera_name = escape(table.lens), escape(table.camera)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',

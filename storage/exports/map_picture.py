@@ -48,7 +48,9 @@ class MapPicture:
 def encode_map(picture: MapPicture) -> bytes:
     """The map as OpenEXR: ZIP compression, B = 0."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **picture.texts}
-    channels = {"R": picture.s, "G": picture.t, "B": np.zeros_like(picture.s)}
+    # The library takes the memory as it lies: of a view with steps it would write other pixels.
+    s, t = (np.ascontiguousarray(channel, dtype=np.float32) for channel in (picture.s, picture.t))
+    channels = {"R": s, "G": t, "B": np.zeros_like(s)}
     out = io.BytesIO()
     OpenEXR.File(header, channels).write(out)
     return out.getvalue()

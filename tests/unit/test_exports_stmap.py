@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
-import OpenImageIO as oiio
+import OpenImageIO
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -99,10 +99,10 @@ def test_openexr_finds_floats_and_the_lens() -> None:
             assert fact in header[NOTE]
 
 
-def oiio_picture(values: np.ndarray[Any, Any]) -> oiio.ImageBuf:
+def oiio_picture(values: np.ndarray[Any, Any]) -> OpenImageIO.ImageBuf:
     height, width, channels = values.shape
-    picture = oiio.ImageBuf(oiio.ImageSpec(width, height, channels, oiio.FLOAT))
-    picture.set_pixels(oiio.ROI(0, width, 0, height), np.ascontiguousarray(values, dtype=np.float32))
+    picture = OpenImageIO.ImageBuf(OpenImageIO.ImageSpec(width, height, channels, OpenImageIO.FLOAT))
+    picture.set_pixels(OpenImageIO.ROI(0, width, 0, height), np.ascontiguousarray(values, dtype=np.float32))
     return picture
 
 
@@ -111,14 +111,14 @@ def warp(source: np.ndarray[Any, Any], exr: bytes) -> np.ndarray[Any, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.exr"
         path.write_bytes(exr)
-        found = oiio.ImageBuf(str(path))
+        found = OpenImageIO.ImageBuf(str(path))
         size = (found.spec().width, found.spec().height)
-        out = oiio.ImageBuf(oiio.ImageSpec(*size, source.shape[2], oiio.FLOAT))
-        made = oiio.ImageBufAlgo.st_warp(
+        out = OpenImageIO.ImageBuf(OpenImageIO.ImageSpec(*size, source.shape[2], OpenImageIO.FLOAT))
+        made = OpenImageIO.ImageBufAlgo.st_warp(
             out, oiio_picture(source), found, "triangle", 0.0, chan_s=0, chan_t=1, flip_s=False, flip_t=True
         )
-        assert made, oiio.geterror() or out.geterror()
-        return np.asarray(out.get_pixels(oiio.FLOAT))
+        assert made, OpenImageIO.geterror() or out.geterror()
+        return np.asarray(out.get_pixels(OpenImageIO.FLOAT))
 
 
 def places(size: tuple[int, int]) -> np.ndarray[Any, Any]:
@@ -326,8 +326,9 @@ def test_bad_files_are_one_line(data: bytes, words: str, capfd: pytest.CaptureFi
 
 def test_the_same_file_name_twice_is_refused() -> None:
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
-        for _ in range(2):
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("a.exr", map_of("distort"))
+        with pytest.warns(UserWarning, match="Duplicate"):
             archive.writestr("a.exr", map_of("distort"))
     with pytest.raises(BadDocument, match="a file twice"):
         read_stmap(out.getvalue())
