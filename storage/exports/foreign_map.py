@@ -20,7 +20,9 @@ from storage.exports.map_picture import MapPicture
 
 FITS_PX = 0.05
 """Largest RMS (per coordinate) of a map that is said to be of this lens model; rounding leaves 2e-5 at 1080p."""
-_CLEARER, _ROUNDING_PX = 5.0, 1e-4
+_CLEARER = 5.0
+_ROUNDING = 2e-8
+"""RMS that 32-bit floats leave, in widths of the picture (1e-8 measured)."""
 _GRID = (48, 27)
 _LEAST_POINTS = 50
 
@@ -72,7 +74,7 @@ def fit_map(picture: MapPicture, place: str) -> MapFit:
             f"is not a lens of k1 and k2: {fits[0].rms_px:.3g} px RMS are left",
             "use a map without overscan, margins or other terms",
         )
-    if fits[1].rms_px < _CLEARER * max(fits[0].rms_px, _ROUNDING_PX):
+    if fits[1].rms_px < _CLEARER * max(fits[0].rms_px, _ROUNDING * width):
         raise BadDocument(
             place, "moves its pixels too little to show which way it goes", "take the coefficients from their source"
         )
