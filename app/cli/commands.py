@@ -95,7 +95,10 @@ cli.command(
 cli.command(
     "export",
     rich_help_panel=_TABLES,
-    epilog=_examples("lensmatch export table.json --format csv --out table.csv"),
+    epilog=_examples(
+        "lensmatch export table.json --format csv --out table.csv",
+        "lensmatch export table.json --format stmap --zoom 0.5 --focus 0 --overscan 1.15 --out maps.zip",
+    ),
 )(export_table)
 cli.command(
     "import",

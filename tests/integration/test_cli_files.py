@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+import zipfile
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +20,16 @@ from app.jobs.provenance import inputs_sha256, sha256_of_all
 from benchmarks.pictures import draw_board, random_view
 from calibration.compare import overlay
 from calibration.lens import Lens
+from calibration.tables import LevelResult
 from storage.exports import EXPORTS
+from storage.exports.map_picture import MapPicture, decode_map, encode_map
+from tests.support.lens_tables import NO_EVIDENCE, assert_carried, table_of
 
 import cv2  # isort: skip  (calibration.image sets OpenCV's bound on picture sizes before its first import)
 
 RUNNER = CliRunner()
 SQUARES = (7, 6)
+SMALL_LENS = Lens((160, 90), 120.0, -0.15, 0.03, (1.5, -0.5))
 
 
 def invoke(*words: str | Path) -> Result:
@@ -299,6 +304,67 @@ def test_what_a_format_does_to_a_table_is_said(repository: Path, tmp_path: Path)
     told = json.loads(invoke("export", golden, "--format", "opentrackio-du", "--out", out, "--json").stdout)
     assert "entrancePupilOffset" in told["cannot_carry"][1]
     assert "max 0.00047 px at zoom 0, focus 0.5" in told["advice"][0]
+
+
+@pytest.mark.parametrize("name", [name for name, export in EXPORTS.items() if export.cannot_carry])
+def test_a_table_goes_through_every_format(repository: Path, tmp_path: Path, name: str) -> None:
+    """A small picture, so that the formats that draw one are fast."""
+    level = LevelResult.from_lens(0.25, 0.5, SMALL_LENS, reasons=NO_EVIDENCE)
+    table = table_of(level, LevelResult.failed(0.5, 0.5, "no board"), image_size=SMALL_LENS.image_size)
+    source, out, back = tmp_path / "t.json", tmp_path / f"t{EXPORTS[name].suffix}.out", tmp_path / "back.json"
+    source.write_bytes(EXPORTS["json"].write(table))
+    result = invoke("export", source, "--format", name, "--out", out)
+    assert result.exit_code == 0, result.stderr
+    assert "1 of 2 levels" in result.stderr
+    assert "not in this format: sigmas" in result.stderr
+    assert invoke("import", out, "--format", name, "--out", back).exit_code == 0
+    assert_carried(table, EXPORTS["json"].read(back.read_bytes()))
+    told = json.loads(invoke("export", source, "--format", name, "--out", out, "--json").stdout)
+    assert told["cannot_carry"] == list(EXPORTS[name].cannot_carry)
+    out.write_bytes(out.read_bytes()[:-40])
+    assert str(out) in reason(invoke("import", out, "--format", name))
+
+
+def test_one_place_of_a_table_is_exported(tmp_path: Path) -> None:
+    source, out = tmp_path / "t.json", tmp_path / "out.csv"
+    places = [(0.0, 0.0), (0.0, 0.5), (1.0, 0.5)]
+    levels = (LevelResult.from_lens(zoom, focus, SMALL_LENS, reasons=NO_EVIDENCE) for zoom, focus in places)
+    source.write_bytes(EXPORTS["json"].write(table_of(*levels, image_size=SMALL_LENS.image_size)))
+
+    def exported(*words: str) -> list[tuple[float, float]]:
+        result = invoke("export", source, "--format", "csv", "--out", out, *words)
+        assert result.exit_code == 0, result.stderr
+        return [(level.zoom, level.focus) for level in EXPORTS["csv"].read(out.read_bytes()).levels]
+
+    assert exported() == places
+    assert exported("--zoom", "0") == places[:2]
+    assert exported("--focus", "0.5") == places[1:]
+    assert exported("--zoom", "0", "--focus", "0.5") == [(0.0, 0.5)]
+    words = ("export", source, "--format", "csv", "--out", out)
+    assert "no level has this zoom; the table has zoom 0, 1" in reason(invoke(*words, "--zoom", "0.3"))
+    assert "the table has zoom / focus 0 / 0, 0 / 0.5, 1 / 0.5" in reason(invoke(*words, "--zoom", "1", "--focus", "0"))
+
+
+def test_st_maps_have_options_of_their_own(tmp_path: Path) -> None:
+    source, out, single = tmp_path / "t.json", tmp_path / "t.zip", tmp_path / "one.exr"
+    level = LevelResult.from_lens(0.25, 0.5, SMALL_LENS, reasons=NO_EVIDENCE)
+    source.write_bytes(EXPORTS["json"].write(table_of(level, image_size=SMALL_LENS.image_size)))
+    result = invoke("export", source, "--format", "stmap", "--overscan", "1.25", "--out", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert "keeps every pixel" in json.loads(result.stdout)["advice"][0]
+    with zipfile.ZipFile(out) as archive:
+        undistort, _ = (decode_map(archive.read(name), "") for name in archive.namelist())
+    assert undistort.size == (200, 114)  # 160 x 90 and 20, 12 px on each side
+    map_without_lens = encode_map(MapPicture(undistort.s[12:-12, 20:-20], undistort.t[12:-12, 20:-20]))
+    single.write_bytes(map_without_lens)
+    assert "give it: --fov-x" in reason(invoke("import", single, "--format", "stmap"))
+    result = invoke("import", single, "--format", "stmap", "--fov-x", str(SMALL_LENS.fov_x_deg), "--json")
+    (found,) = json.loads(result.stdout)["levels"]
+    assert found["k1"] == pytest.approx(SMALL_LENS.k1, rel=1e-3)
+    assert "--overscan is for ST maps" in reason(
+        invoke("export", source, "--format", "csv", "--overscan", "1.2", "--out", out), 2
+    )
+    assert "--fov-x is for ST maps" in reason(invoke("import", source, "--format", "json", "--fov-x", "50"), 2)
 
 
 def test_bad_tables_are_one_line_and_leave_nothing(tmp_path: Path) -> None:

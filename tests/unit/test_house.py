@@ -185,7 +185,12 @@ def test_every_outside_import_is_declared(repository: Path) -> None:
     dependencies = _project(repository)["dependencies"]
     assert isinstance(dependencies, list)
     declared = {re.match(r"[a-z0-9-]+", dependency).group().replace("-", "_") for dependency in dependencies}
-    modules_of = {"opencv_python_headless": "cv2", "pillow": "PIL", "python_multipart": "multipart"}
+    modules_of = {
+        "opencv_python_headless": "cv2",
+        "openexr": "OpenEXR",
+        "pillow": "PIL",
+        "python_multipart": "multipart",
+    }
     known = {modules_of.get(name, name) for name in declared} | set(PACKAGES) | set(sys.stdlib_module_names)
     # click and annotated_types are part of the interface of typer and pydantic.
     known |= {"click", "annotated_types"}
