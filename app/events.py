@@ -54,7 +54,7 @@ class JobQueued(Event):
     camera: str
     engine: str
     method: str
-    levels: Count = Field(description="how many levels the job has")
+    levels: Count = Field(description="how many levels the job has, as far as it is known")
 
 
 class JobStarted(Event):
@@ -62,7 +62,14 @@ class JobStarted(Event):
 
     kind: Literal["job_started"] = "job_started"
     engine: str
-    levels: Count = Field(description="how many levels the job has")
+    levels: Count = Field(description="how many levels the job has, as far as it is known")
+
+
+class LevelsPlanned(Event):
+    """The job has more levels than were told before."""
+
+    kind: Literal["levels_planned"] = "levels_planned"
+    levels: Count = Field(description="how many levels the job has, as far as it is known now")
 
 
 class LevelStarted(LevelEvent):
@@ -285,6 +292,7 @@ class Note(Event):
 AnyEvent = Annotated[
     JobQueued
     | JobStarted
+    | LevelsPlanned
     | LevelStarted
     | CaptureAsked
     | TargetFound

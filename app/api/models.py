@@ -27,7 +27,7 @@ class JobView(_View):
     reason: str | None = Field(description="why it failed or was cancelled")
     lens: str
     engine: str
-    levels: int = Field(description="how many levels it has to measure")
+    levels: int = Field(description="how many levels it has to measure, as far as it is known")
     created: datetime
     updated: datetime
     last_seq: int = Field(description="seq of its last event")
@@ -59,8 +59,10 @@ class JobDetail(JobView):
 
     @classmethod
     def build(cls, job: JobRecord, levels: Sequence[LevelRecord], table: TableSummary | None) -> Self:
+        fields = _job_fields(job)
+        planned = len({(level.result.zoom, level.result.focus) for level in levels})
         return cls(
-            **_job_fields(job),
+            **{**fields, "levels": max(fields["levels"], planned)},
             request=job.request,
             results=[LevelView.of(level) for level in levels],
             table_id=None if table is None else table.id,

@@ -98,7 +98,9 @@ async def _follow(service: Service, job_id: str, levels: int, show: Show) -> lis
                 seen = record.seq
                 event = message(record)
                 kind = event["kind"]
-                if kind == "level_started":
+                if kind == "levels_planned":
+                    levels = event["levels"]
+                elif kind == "level_started":
                     level, share = f"zoom {event['zoom']:.3g} focus {event['focus']:.3g}", 0.0
                 elif kind == "level_progress":
                     share = event["progress"]

@@ -38,6 +38,7 @@ RESULT = LevelResult.from_lens(
 SAMPLES: list[events.AnyEvent] = [
     events.JobQueued(lens="XA 20x", camera="Cam0", engine="default", method="joint", levels=13),
     events.JobStarted(engine="default", levels=13),
+    events.LevelsPlanned(levels=15),
     events.LevelStarted(**PLACE),
     events.CaptureAsked(**PLACE, step=0, source="real", target="board", pan_deg=-3.5, tilt_deg=0.0),
     events.TargetFound(**PLACE, step=0, points=49, blur_px=1.5),
