@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.engines import EngineInfo
 from app.events import EventMessage
+from app.job_documents import kind_of
 from storage.records import JobRecord, JobState, LensRecord, LevelRecord, TableSummary
 from storage.schemas import LevelDocument, level_to_document
 
@@ -23,6 +24,7 @@ class JobView(_View):
 
     id: str
     number: int = Field(description="counts jobs in the order of their creation")
+    kind: str = Field(description="what it does: calibrate, publish ...")
     state: JobState
     reason: str | None = Field(description="why it failed or was cancelled")
     lens: str
@@ -73,6 +75,7 @@ def _job_fields(job: JobRecord) -> dict[str, Any]:
     return {
         "id": job.id,
         "number": job.number,
+        "kind": kind_of(job.request),
         "state": job.state,
         "reason": job.reason,
         "lens": job.lens,

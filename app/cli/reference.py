@@ -62,6 +62,10 @@ _DOCUMENTS = {
     '"quality": {"score":, "contrast":, "fit_chi2":, "grid_rms_px":}, "seconds":}`, points row by row, `point_ids` '
     "which of the target's points each one is (a board may be partly hidden), `null` what is not told; or "
     '`{"found": false, "reason":, "error":}` with exit code 1',
+    "`publish`": '`{"published":, "zoom":, "focus":, "compared":, "render_px": {"rms":, "max":}, "reason":, "places": '
+    '[{"zoom":, "focus":, "values": [{"name":, "asked":, "got":, "same":}], "compared":, "renders":, "render_px":, '
+    '"limit_px":, "reason":, "ok":}], "job":}`, `null` what is not told; a publication that failed has `"error":` '
+    "besides",
     "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "

@@ -29,7 +29,7 @@ from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
 from app.jobs.sweep import LevelPlan, SweepPlan, level_task
 from app.jobs.taking import PictureTaker
-from app.jobs.work import Ending, JobTools, JobWorkFailed, Subject
+from app.jobs.work import HOME_BOUND_S, Ending, JobTools, JobWorkFailed, Subject
 from calibration.compare import Overlay, predicted_overlay
 from calibration.solve.alternating import AlternatingMethod
 from calibration.solve.engine_model import Direction, EngineModel
@@ -46,8 +46,6 @@ log = logging.getLogger("lensmatch.jobs")
 
 _STUDIO_FAILURES = 2
 # Levels in a row that the studio failed (engine gone, output dead) before the job gives up: the rest would fail too.
-_HOME_BOUND_S = 20.0
-# Longest wait for head and lens to go back to where they stood; it is a courtesy, not part of the result.
 
 
 class _Background:
@@ -109,7 +107,7 @@ async def _lens_as_found(engine: RenderEngine) -> LensValues | None:
         return None
 
 
-async def subject(request: JobRequest) -> Subject:
+def subject(request: JobRequest) -> Subject:
     """What a calibration job is about."""
     pictures = PictureFacts(request.image_size, request.pixel_aspect)
     return Subject(request.lens, request.camera, request.method, len(request.levels), pictures)
@@ -165,7 +163,7 @@ class Calibration:
                 await tools.cpu.run(plan.tell, self._results[-1])
             asked = await tools.cpu.run(plan.ask)
         try:
-            async with asyncio.timeout(_HOME_BOUND_S):
+            async with asyncio.timeout(HOME_BOUND_S):
                 await taker.home(stood)
         except (AdapterError, TimeoutError) as error:
             await tools.event(Note(text=f"head and lens were not turned back: {error}"))
@@ -283,3 +281,7 @@ class Calibration:
         )
         summary = await self._tools.repository.save_table(self._tools.job_id, table)
         return Ending(JobDone(table_id=summary.id), reason)
+
+    def left(self) -> str:
+        """What a cancelled calibration leaves."""
+        return "finished levels are kept"

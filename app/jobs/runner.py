@@ -10,7 +10,7 @@ from datetime import datetime
 
 from pydantic import ValidationError
 
-from app.documents import JobRequest, one_line
+from app.documents import one_line
 from app.engines import EngineError, EngineInfo, Engines, Lease
 from app.errors import QueueFull
 from app.events import (
@@ -21,12 +21,12 @@ from app.events import (
     JobCancelled,
     JobCancelling,
     JobFailed,
-    JobQueued,
     JobStarted,
     draft,
 )
-from app.jobs.calibrating import Calibration, subject
+from app.job_documents import CALIBRATE, AnyJob, kind_of, parse_job
 from app.jobs.cpu import Cpu
+from app.jobs.kinds import STOPPED, queued, subject_of, work_of
 from app.jobs.state import sources
 from app.jobs.work import JobTools, JobWork, JobWorkFailed
 from calibration.errors import CalibrationError
@@ -44,6 +44,10 @@ class _Worker:
     loop: asyncio.Task[None] | None = None
     job_id: str | None = None
     job: asyncio.Task[None] | None = None
+
+
+def _stopped(job: JobRecord) -> str:
+    return f"the service stopped while the job ran; {STOPPED.get(kind_of(job.request), STOPPED[CALIBRATE])}"
 
 
 class JobRunner:
@@ -79,7 +83,7 @@ class JobRunner:
             if job.state is JobState.QUEUED and job.engine in self._workers:
                 self._workers[job.engine].queue.put_nowait(job.id)
             else:
-                await self._fail(job.id, "the service stopped while the job ran; its finished levels are kept")
+                await self._fail(job.id, _stopped(job))
 
     async def close(self) -> None:
         """End the running jobs (engine restored, finished levels kept) and the workers."""
@@ -101,21 +105,19 @@ class JobRunner:
         """The engines as clients see them."""
         return self._engines.infos()
 
-    async def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobRecord:
-        """Store a job and queue it. Raises UnknownEngine, StudioMismatch, QueueFull, IdempotencyConflict."""
-        about = await subject(request)
+    async def submit(self, request: AnyJob, *, idempotency_key: str | None = None) -> JobRecord:
+        """Store a job and queue it.
+
+        Raises UnknownEngine, StudioMismatch, QueueFull, IdempotencyConflict, NotFound (for a table that it names).
+        """
+        self._engines.require(request.engine)
+        about = await subject_of(request, self._repository)
         self._engines.require_pictures(request.engine, about.pictures)
         worker = self._workers[request.engine]
         if sum(w.queue.qsize() for w in self._workers.values()) >= self._queue_limit:
             raise QueueFull(self._queue_limit, self._retry_after_s)
         body = request.model_dump(mode="json")
-        event = JobQueued(
-            lens=about.lens,
-            camera=about.camera,
-            engine=request.engine,
-            method=request.method,
-            levels=about.levels,
-        )
+        event = queued(request, about)
         record = await self._repository.create_job(body, about.lens, request.engine, idempotency_key, draft(event))
         if record.state is JobState.QUEUED and record.last_seq == 1:
             worker.queue.put_nowait(record.id)
@@ -158,28 +160,29 @@ class JobRunner:
 
     async def _run(self, job_id: str) -> None:
         """One job from queued to its end; every way out leaves a terminal state and its event."""
+        work: JobWork | None = None
         try:
             record = await self._repository.get_job(job_id)
             if record.state is not JobState.QUEUED:
                 return  # cancelled while it waited
             try:
-                request = JobRequest.model_validate(dict(record.request))
+                request = parse_job(record.request)
             except ValidationError as error:
                 # Queued under rules that another version has made stricter.
                 await self._fail(job_id, f"the stored job is refused: {one_line(error)}; correct it and send it again")
                 return
             # Asked again: it may have waited through a restart, and the profile may have been changed meanwhile.
-            about = await subject(request)
+            about = await subject_of(request, self._repository)
             self._engines.require_pictures(request.engine, about.pictures)
             started = JobStarted(engine=request.engine, levels=about.levels)
             await self._change(job_id, JobState.RUNNING, None, started)
             tools = JobTools(job_id, self._repository, self._broker, self._cpu, self._now)
-            work = Calibration(request, tools)
+            work = work_of(request, tools)
             await self._on_engine(request.engine, work, tools)
             ending = await work.finish()
             await self._change(job_id, JobState.DONE, ending.reason, ending.event)
         except asyncio.CancelledError:
-            await self._end_cancelled(job_id)
+            await self._end_cancelled(job_id, work)
             raise
         except (AdapterError, EngineError, JobWorkFailed, CalibrationError) as error:
             await self._fail(job_id, str(error))
@@ -201,14 +204,15 @@ class JobRunner:
             elif lease is not None:
                 await tools.event(EngineDirty(engine=engine, reason=lease.problem or "unknown"))
 
-    async def _end_cancelled(self, job_id: str) -> None:
+    async def _end_cancelled(self, job_id: str, work: JobWork | None) -> None:
         """A cancelled task: the operator's cancel, or the service ending."""
         try:
             record = await self._repository.get_job(job_id)
             if record.state is JobState.CANCELLING:
-                await self._change(job_id, JobState.CANCELLED, "cancelled; finished levels are kept", JobCancelled())
+                left = "nothing was begun" if work is None else work.left()
+                await self._change(job_id, JobState.CANCELLED, f"cancelled; {left}", JobCancelled())
             elif record.state is JobState.RUNNING:
-                await self._fail(job_id, "the service stopped while the job ran; its finished levels are kept")
+                await self._fail(job_id, _stopped(record))
         except StorageError as error:
             log.error("the end of job %s could not be stored: %s", job_id, error)
 

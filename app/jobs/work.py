@@ -13,6 +13,9 @@ from app.events import AnyEvent, EventBroker, JobDone, draft
 from app.jobs.cpu import Cpu
 from storage.repository import Repository
 
+HOME_BOUND_S = 20.0
+"""Longest wait for head and lens to go back to where they stood; it is a courtesy, not part of the result."""
+
 
 @dataclass(frozen=True, slots=True)
 class Subject:
@@ -72,4 +75,8 @@ class JobWork(Protocol):
 
     async def finish(self) -> Ending:
         """Once the engine is given back: store what the job leaves. Raises as :meth:`run`."""
+        ...
+
+    def left(self) -> str:
+        """What the job leaves when it is cancelled now, for its reason."""
         ...
