@@ -29,7 +29,7 @@ class JobView(_View):
     reason: str | None = Field(description="why it failed or was cancelled")
     lens: str
     engine: str
-    levels: int = Field(description="how many levels it has to measure, as far as it is known")
+    levels: int = Field(description="how many levels it has to measure, as far as it is known; 0: none")
     created: datetime
     updated: datetime
     last_seq: int = Field(description="seq of its last event")
