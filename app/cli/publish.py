@@ -89,6 +89,8 @@ def publish(
     with reported_errors(as_json):
         if (zoom is None) != (focus is None):
             wrong_usage("--zoom and --focus are given together, or neither")
+        if learn and room is None:
+            wrong_usage("--learn needs --room: an engine is learned from renders of a surveyed target")
         settings = build_settings(database=database)
         document = table_to_document(_read(table))
         survey = read_job(room) if room is not None else None

@@ -245,6 +245,13 @@ class Publication:
         if not trouble and room is not None:
             agreement = await self._compare(place, asked, lease, taker, _task(place, table, room))
             trouble = agreement.trouble
+            if trouble and model is not None:
+                shortfall_px = await tools.cpu.run(model.shortfall_px, place.lens)
+                if shortfall_px > agreement.limit_px:
+                    trouble = (
+                        f"the engine cannot draw this lens nearer than {shortfall_px:.2f} px everywhere, whatever it "
+                        f"is told ({agreement.limit_px:.2f} px are taken): raise limit_px if that will do"
+                    )
         off = agreement.off_px if agreement is not None else None
         checked = PlaceChecked(
             ordinal=ordinal,

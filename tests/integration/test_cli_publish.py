@@ -92,6 +92,7 @@ async def test_an_engine_that_clips_is_a_failure_with_the_value(folder: Path) ->
         assert await engine.read_state() == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends Ctrl-C to whole consoles only")
 async def test_ctrl_c_gives_the_engine_back(lensmatch: Any) -> None:
     # The output's pictures come late, so that there is time to interrupt.
@@ -116,6 +117,7 @@ async def test_ctrl_c_gives_the_engine_back(lensmatch: Any) -> None:
     [
         (("publish", "table.json", "--zoom", "0.5"), 2, "--zoom and --focus are given together"),
         (("publish", "table.json", "--zoom", "0.5", "--focus", "2"), 2, "'--focus': Input should be less"),
+        (("publish", "table.json", "--learn"), 2, "--learn needs --room"),
         (("publish", "none.json"), 1, "none.json: no such file"),
         (("publish", "job.json"), 1, 'has no "lens_table" field'),
         (("publish", "table.json", "--room", "table.json"), 1, "table.json: "),

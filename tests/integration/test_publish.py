@@ -150,6 +150,26 @@ async def test_a_table_of_a_job_is_compared_by_that_jobs_targets(tmp_path: Path)
             await b.service.runner.submit(b.request(room=False, table_id=99))
 
 
+@pytest.mark.slow
+async def test_what_a_job_measured_on_an_engine_of_another_kind_is_published_to_it(tmp_path: Path) -> None:
+    async with publishing(tmp_path, "--engine", "radius_unit=half_width") as b:
+        found = dict(await b.engine_values())
+        made = await b.service.runner.submit(b.job(HERE))
+        assert (await b.ended(made.id)).kind == "job_done"
+        assert dict(await b.engine_values()) == found
+        stored = await b.service.repository.table_of_job(made.id)
+        assert stored is not None
+        (level,) = (await b.service.repository.get_table(stored.id)).table.levels
+        assert level.engine_values is not None
+        last, _, result = await b.publish(b.request(room=False, table_id=stored.id))
+        assert last.kind == "job_done", last.data
+        assert (result.kept, result.compared) == (True, True)
+        assert result.render_px is not None
+        assert result.render_px.max < 0.2
+        assert (await b.lens()).k1 == pytest.approx(level.engine_values.k1, rel=1e-9)
+        assert level.k1 != pytest.approx(level.engine_values.k1, rel=0.1)
+
+
 @pytest.mark.parametrize("room", [True, False])
 async def test_a_value_that_the_engine_clips_is_named_and_nothing_stays(tmp_path: Path, room: bool) -> None:
     async with publishing(tmp_path, "--fault", "r3:clip=0.01@*") as b:
@@ -164,6 +184,7 @@ async def test_a_value_that_the_engine_clips_is_named_and_nothing_stays(tmp_path
         assert await b.engine_values() == found
 
 
+@pytest.mark.slow
 async def test_an_engine_that_counts_otherwise_is_seen_in_its_render(tmp_path: Path) -> None:
     async with publishing(tmp_path, "--engine", "radius_unit=half_width") as b:
         found = await b.engine_values()
@@ -183,6 +204,23 @@ async def test_an_engine_that_counts_otherwise_is_seen_in_its_render(tmp_path: P
         assert result.render_px.max < 0.15
         assert "engine_learned" in [event.kind for event in events]
         assert flat(await b.lens()) != pytest.approx(flat(true_lens(LENS, *HERE)), rel=1e-3)
+
+
+@pytest.mark.slow
+async def test_a_lens_that_the_engine_cannot_draw_is_told_with_its_pixels(tmp_path: Path) -> None:
+    async with publishing(tmp_path, "--engine", "direction=reverse") as b:
+        found = await b.engine_values()
+        wide = LevelResult.from_lens(0.0, 0.25, true_lens(LENS, 0.0, 0.25), reasons=UNTOLD)
+        place = {"zoom": 0.0, "focus": 0.25, "learn_engine": True}
+        last, _, result = await b.publish(b.request(table(wide), limit_px=0.02, **place))
+        assert last.kind == "job_failed"
+        assert "the engine cannot draw this lens nearer than 0." in last.data["reason"]
+        assert not result.kept
+        assert await b.engine_values() == found
+        last, _, result = await b.publish(b.request(table(wide), limit_px=1.0, **place))
+        assert last.kind == "job_done", last.data
+        assert result.render_px is not None
+        assert 0.02 < result.render_px.max < 1.0
 
 
 async def test_a_levels_engine_values_are_what_the_engine_is_told(tmp_path: Path) -> None:
