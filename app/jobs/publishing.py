@@ -175,9 +175,10 @@ class Publication:
         request, repository = self._request, self._tools.repository
         if request.pivot_m is not None:
             return _Room(request.targets, request.pivot_m)
-        self._not_compared = "the table does not come from a job of this service; give targets and pivot_m"
+        self._not_compared = "no targets were given"
         if request.table_id is None:
             return None
+        self._not_compared = "no targets were given, and no job of this service that can be read made the table"
         job_id = (await repository.get_table(request.table_id)).summary.job_id
         if job_id is None:
             return None
