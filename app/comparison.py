@@ -7,6 +7,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from app.lens_at import between_levels
 from calibration.compare_tables import (
     AGREEING_SIGMAS,
     BOTH,
@@ -156,7 +157,9 @@ class ComparisonDocument(_View):
 
 def compared(first: LensTable, second: LensTable) -> ComparisonDocument:
     """Compare two tables. Raises :class:`calibration.errors.InvalidInput` where they cannot be compared."""
-    return ComparisonDocument.of(first, second, compare_tables(first, second))
+    return ComparisonDocument.of(
+        first, second, compare_tables(first, second, between_levels(first), between_levels(second))
+    )
 
 
 def verdict(found: TableComparison) -> str:

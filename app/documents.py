@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -67,7 +68,9 @@ class _Loose(BaseModel):
         return data
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """Base of documents in which a field that is not known is refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -193,7 +196,7 @@ class PictureSet(_Loose):
         return self
 
 
-class LevelModel(_Strict):
+class LevelModel(Strict):
     """One level: encoder values 0..1 (zoom 0 wide, 1 tele; focus 0 infinity, 1 near)."""
 
     zoom: Unit
@@ -214,10 +217,19 @@ def _check_faces(name: str, pose: TargetPoseModel, pivot_m: tuple[float, float, 
         )
 
 
-class JobRequest(_Strict):
+def check_room(targets: Mapping[str, TargetModel], pivot_m: tuple[float, float, float]) -> None:
+    """Refuse targets that an engine cannot draw where they stand, or the camera never sees. Raises ValueError."""
+    for name, target in targets.items():
+        if target.pose is None:
+            raise ValueError(f"targets.{name}.pose is missing: an engine's target needs its surveyed place")
+        _check_faces(name, target.pose, pivot_m)
+
+
+class JobRequest(Strict):
     """A calibration job for an engine: which lens, which levels, what stands in the room."""
 
     job: Literal[1] = 1
+    kind: Literal["calibrate"] = "calibrate"
     lens: Name
     camera: Name = "Cam0"
     engine: Name = Field(default="default", description="name of the studio profile's engine; one job at a time on it")
@@ -246,10 +258,7 @@ class JobRequest(_Strict):
 
     @model_validator(mode="after")
     def _can_be_measured(self) -> JobRequest:
-        for name, target in self.targets.items():
-            if target.pose is None:
-                raise ValueError(f"targets.{name}.pose is missing: an engine's target needs its surveyed place")
-            _check_faces(name, target.pose, self.pivot_m)
+        check_room(self.targets, self.pivot_m)
         seen: set[tuple[float, float]] = set()
         for index, level in enumerate(self.levels):
             if (level.zoom, level.focus) in seen:

@@ -132,12 +132,36 @@ class _Slot:
 
 @dataclass(slots=True)
 class Lease:
-    """An engine held by one job. Values as found are put back when the lease ends."""
+    """An engine held by one job. Values as found are put back when the lease ends, but for those that it keeps.
+
+    ``kept``: (name, value) pairs that stay, empty where none do; a lease that ends by an error or a cancellation keeps
+    none.
+    """
 
     studio: Studio
     found: EngineState
+    kept: tuple[tuple[str, str], ...] = ()
     restored: bool = False
     problem: str | None = None
+
+    def keep(self, values: Iterable[tuple[str, str]]) -> None:
+        """Let these exports, as the engine now holds them, stay when the lease ends well.
+
+        Sends nothing: at the end they are set with all others, so that a value lost meanwhile is set again. Raises
+        :class:`EngineError` for an export that was not there when the engine was found.
+        """
+        values = tuple(values)
+        known = {name for name, _ in self.found.exports}
+        for name, _ in values:
+            if name not in known:
+                raise EngineError(f"export {name!r} was not read when the engine was leased; it cannot be kept")
+        self.kept = values
+
+    @property
+    def at_end(self) -> EngineState:
+        """What the engine is left with: as found, with the kept values in their places."""
+        kept = dict(self.kept)
+        return EngineState(tuple((name, kept.get(name, value)) for name, value in self.found.exports))
 
 
 class Engines:
@@ -199,7 +223,8 @@ class Engines:
 
     @asynccontextmanager
     async def lease(self, name: str, job_id: str) -> AsyncIterator[Lease]:
-        """Hold an engine; on leaving, however that happens, its values are put back as they were found.
+        """Hold an engine; on leaving, however that happens, its values are put back as they were found (but for those
+        that :meth:`Lease.keep` keeps, where all went well).
 
         Raises :class:`UnknownEngine`, :class:`EngineInUse`, or the adapters' errors when the engine is not there. The
         lease object then tells whether the values could be put back (``restored``, ``problem``); if not, the engine
@@ -216,8 +241,11 @@ class Engines:
                 lease = await self._begin(slot, studio)
                 try:
                     yield lease
+                except BaseException:
+                    lease.kept = ()
+                    raise
                 finally:
-                    await _finish_shielded(self._end(slot, lease))
+                    await self._end_for_sure(slot, lease)
             finally:
                 await studio.close()
         finally:
@@ -229,21 +257,32 @@ class Engines:
             slot.found, slot.dirty = None, None
         return Lease(studio, await studio.engine.read_state())
 
+    async def _end_for_sure(self, slot: _Slot, lease: Lease) -> None:
+        try:
+            await _finish_shielded(self._end(slot, lease))
+        except asyncio.CancelledError:
+            if lease.kept:
+                # Cancelled while its end was written: a cancelled job keeps nothing.
+                lease.kept, lease.restored = (), False
+                await _finish_shielded(self._end(slot, lease))
+            raise
+
     async def _end(self, slot: _Slot, lease: Lease) -> None:
         try:
             async with asyncio.timeout(RESTORE_BOUND_S):
                 for attempt in (1, 2):
                     try:
-                        await lease.studio.engine.restore(lease.found)
+                        await lease.studio.engine.restore(lease.at_end)
                         break
                     except AdapterError:
                         # The first try may meet a connection that a cancelled exchange has closed.
                         if attempt == 2:
                             raise
-            lease.restored = True
+            lease.restored, lease.problem = True, None
+            slot.found, slot.dirty = None, None
         except (AdapterError, TimeoutError) as error:
             lease.problem = str(error) or f"not within {RESTORE_BOUND_S:g} s"
-            slot.found, slot.dirty = lease.found, lease.problem
+            slot.found, slot.dirty = lease.at_end, lease.problem
 
 
 def _mismatch(field: str, job: str, profile: str) -> NoReturn:

@@ -50,11 +50,12 @@ class JobQueued(Event):
     """The job is stored and waits for its engine."""
 
     kind: Literal["job_queued"] = "job_queued"
+    job: str = Field(default="calibrate", description="what kind of job it is: calibrate, publish ...")
     lens: str
     camera: str
     engine: str
-    method: str
-    levels: Count = Field(description="how many levels the job has")
+    method: str | None = Field(default=None, description="how levels are measured; null: the job measures none")
+    levels: Count = Field(description="how many levels the job has, as far as it is known")
 
 
 class JobStarted(Event):
@@ -62,7 +63,14 @@ class JobStarted(Event):
 
     kind: Literal["job_started"] = "job_started"
     engine: str
-    levels: Count = Field(description="how many levels the job has")
+    levels: Count = Field(description="how many levels the job has, as far as it is known")
+
+
+class LevelsPlanned(Event):
+    """The job has more levels than were told before."""
+
+    kind: Literal["levels_planned"] = "levels_planned"
+    levels: Count = Field(description="how many levels the job has, as far as it is known now")
 
 
 class LevelStarted(LevelEvent):
@@ -234,8 +242,50 @@ class EngineLearned(Event):
         )
 
 
+class ValueData(BaseModel):
+    """A value of the lens in the engine, in the engine's own units."""
+
+    model_config = ConfigDict(frozen=True)
+
+    name: str = Field(description="of the scene's export")
+    asked: str = Field(description="the text that was set")
+    got: str = Field(description="the text that the engine gave back")
+    same: bool = Field(description="whether they are one value, within the digits that the engine writes")
+
+
+class PlaceChecked(LevelEvent):
+    """A lens was written to the engine for one place, read back, and seen in the engine's own render."""
+
+    kind: Literal["place_checked"] = "place_checked"
+    values: tuple[ValueData, ...]
+    compared: bool = Field(description="whether a render was compared with what the lens predicts")
+    renders: Count = Field(default=0, description="how many renders were measured")
+    render_px: PixelErrorData | None = Field(
+        default=None, description="the target's points in the render against the prediction, px; rms per coordinate"
+    )
+    limit_px: Number | None = Field(default=None, description="largest of them that is taken, px")
+    reason: str | None = Field(default=None, description="what is wrong, or why no render was compared")
+    ok: bool
+
+
+class Published(Event):
+    """How a publication ended, after the engine was given back."""
+
+    kind: Literal["published"] = "published"
+    engine: str
+    table_id: int | None = Field(default=None, description="the stored table; null: it came with the job")
+    zoom: Number | None = Field(default=None, description="of the place whose lens was to stay; null: not known yet")
+    focus: Number | None = None
+    kept: bool = Field(description="true: the engine keeps the lens of that place; false: it has its own values back")
+    compared: bool = Field(description="whether renders were compared; false: values were only written and read back")
+    places: Count = Field(description="how many places were checked")
+    values: tuple[ValueData, ...] = Field(default=(), description="what the engine holds for the place")
+    render_px: PixelErrorData | None = Field(default=None, description="worst of all places, px; null: not compared")
+    reason: str | None = Field(default=None, description="why it failed, or what was not checked")
+
+
 class EngineRestored(Event):
-    """The engine has its values back as they were found."""
+    """The engine has its values back as they were found, but for those that the job leaves in it on purpose."""
 
     kind: Literal["engine_restored"] = "engine_restored"
     engine: str
@@ -250,14 +300,14 @@ class EngineDirty(Event):
 
 
 class JobDone(Event):
-    """The job is done and its lens table is stored. The job's last event."""
+    """The job is done and what it makes is stored. The job's last event."""
 
     kind: Literal["job_done"] = "job_done"
-    table_id: int = Field(description="the table's id, as in GET /api/v1/tables/{id}")
+    table_id: int | None = Field(description="the table's id, as in GET /api/v1/tables/{id}; null: it makes none")
 
 
 class JobFailed(Event):
-    """The job ended without a table. The job's last event."""
+    """The job came to nothing. The job's last event."""
 
     kind: Literal["job_failed"] = "job_failed"
     reason: Reason
@@ -270,7 +320,7 @@ class JobCancelling(Event):
 
 
 class JobCancelled(Event):
-    """The job was cancelled; the levels finished before are kept. The job's last event."""
+    """The job was cancelled; what it finished before is kept. The job's last event."""
 
     kind: Literal["job_cancelled"] = "job_cancelled"
 
@@ -285,6 +335,7 @@ class Note(Event):
 AnyEvent = Annotated[
     JobQueued
     | JobStarted
+    | LevelsPlanned
     | LevelStarted
     | CaptureAsked
     | TargetFound
@@ -293,6 +344,8 @@ AnyEvent = Annotated[
     | LevelDone
     | LevelFailed
     | EngineLearned
+    | PlaceChecked
+    | Published
     | EngineRestored
     | EngineDirty
     | JobDone

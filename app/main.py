@@ -12,7 +12,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.types import Lifespan
 
-from app.api import errors, jobs, lenses, service, sockets, tables
+from app.api import errors, jobs, lenses, publishing, service, sockets, tables
 from app.api.context import PREFIX, AppContext
 from app.api.guard import Guard
 from app.api.tail import EventTail
@@ -77,7 +77,7 @@ def _routes(lifespan: Lifespan[FastAPI] | None) -> FastAPI:
         lifespan=lifespan,
         responses=errors.responses("internal", "storage-busy"),
     )
-    for part in (jobs, lenses, tables, service, sockets):
+    for part in (jobs, lenses, tables, publishing, service, sockets):
         app.include_router(part.router, prefix=PREFIX)
     return app
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from app import documents, events, main, settings
+from app import documents, events, job_documents, main, settings
 from storage.evidence import evidence_schema_text
 
 
@@ -17,6 +17,7 @@ def pages() -> dict[str, str]:
     return {
         "events.schema.json": events.schema_text(),
         "job.schema.json": documents.schema_text(documents.JobRequest),
+        "publish.schema.json": documents.schema_text(job_documents.PublishRequest),
         "level-evidence.schema.json": evidence_schema_text(),
         "openapi.json": main.openapi_text(),
         "picture-set.schema.json": documents.schema_text(documents.PictureSet),

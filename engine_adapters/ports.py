@@ -47,6 +47,17 @@ class EngineState:
 
 
 @dataclass(frozen=True, slots=True)
+class ReadBack:
+    """One value of the lens in the engine: the export's ``name``, the text it was to hold and the text it ``got``, in
+    the engine's own units. ``same``: whether they are one value, within the digits that the engine writes."""
+
+    name: str
+    asked: str
+    got: str
+    same: bool
+
+
+@dataclass(frozen=True, slots=True)
 class TrackedCamera:
     """A tracking packet, product units: pivot in metres, angles in degrees, FoV in degrees (None: not given)."""
 
@@ -101,6 +112,10 @@ class RenderEngine(Protocol):
 
     async def read_lens(self) -> LensValues:
         """The lens values as the engine now gives them back."""
+        ...
+
+    async def read_back(self, values: LensValues) -> tuple[ReadBack, ...]:
+        """What the engine now holds where :meth:`apply` of these values has set it, value by value."""
         ...
 
     async def show(self, shown: Shown) -> None:

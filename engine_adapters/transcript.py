@@ -34,6 +34,7 @@ from engine_adapters.ports import (
     FrameSource,
     HeadState,
     LensValues,
+    ReadBack,
     RenderEngine,
     Shown,
     TrackedCamera,
@@ -112,7 +113,7 @@ class Recorder:
                 "source": answer.source,
             }
         else:
-            told = None if answer is None else asdict(answer)
+            told = [asdict(part) for part in answer] if isinstance(answer, tuple) else answer and asdict(answer)
         self._write(entry | {"answer": told})
 
     def _write(self, entry: dict[str, Any]) -> None:
@@ -194,6 +195,9 @@ class _RecordingEngine:
     async def read_lens(self) -> LensValues:
         return await self._recorder.note("engine", "read_lens", {}, self._port.read_lens())
 
+    async def read_back(self, values: LensValues) -> tuple[ReadBack, ...]:
+        return await self._recorder.note("engine", "read_back", _lens_arguments(values), self._port.read_back(values))
+
     async def show(self, shown: Shown) -> None:
         await self._recorder.note("engine", "show", {"shown": shown.value}, self._port.show(shown))
 
@@ -257,6 +261,10 @@ class _ReplayEngine:
         told = self._answer("read_lens", {})
         x_px, y_px = told["center_shift_px"]
         return LensValues(**(told | {"center_shift_px": (x_px, y_px)}))
+
+    async def read_back(self, values: LensValues) -> tuple[ReadBack, ...]:
+        told = self._answer("read_back", _lens_arguments(values))
+        return tuple(ReadBack(**held) for held in told)
 
     async def show(self, shown: Shown) -> None:
         self._answer("show", {"shown": shown.value})

@@ -10,9 +10,9 @@ from typing import Annotated, Protocol
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
-from app.documents import JobRequest
 from app.engines import EngineInfo
 from app.events import EventBroker
+from app.job_documents import AnyJob
 from app.settings import Settings
 from storage.records import JobRecord
 from storage.repository import Repository
@@ -23,11 +23,11 @@ PREFIX = "/api/v1"
 class Runner(Protocol):
     """Runs jobs. The ledger has what became of them; a call that was cancelled may still have taken effect."""
 
-    async def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobRecord:
+    async def submit(self, request: AnyJob, *, idempotency_key: str | None = None) -> JobRecord:
         """Store a job and queue it; the same key and request again give the job made before.
 
         Raises :class:`app.engines.UnknownEngine`, :class:`app.errors.QueueFull`,
-        :class:`storage.errors.IdempotencyConflict`.
+        :class:`storage.errors.IdempotencyConflict`, :class:`storage.errors.NotFound` for a table that it names.
         """
         ...
 

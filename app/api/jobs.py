@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query
 from starlette.requests import Request
 from starlette.responses import Response
 
 from app.api.answers import document, tagged
-from app.api.context import PREFIX, Context
+from app.api.context import PREFIX, AppContext, Context
 from app.api.errors import Problem, responses
 from app.api.models import EventList, JobDetail, JobsPage, JobView
-from app.documents import JobRequest
 from app.events import message
+from app.job_documents import AnyJob
 from storage.records import PictureKind
 
 router = APIRouter(tags=["jobs"])
@@ -27,6 +27,21 @@ SHOWN_MEDIA_TYPES = frozenset({"image/jpeg", "image/png"})
 
 JobId = Annotated[str, Path(min_length=1, max_length=64, description="the job's id")]
 Encoder = Annotated[float, Path(ge=0, le=1, allow_inf_nan=False, description="encoder value, 0 to 1")]
+
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=200,
+        pattern=r"^[\x21-\x7e]+$",
+        description="the same key and job again give the job made before, also after a restart",
+    ),
+]
+LOCATION: dict[int | str, dict[str, Any]] = {
+    201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}}
+}
+"""What a route that submits a job answers with."""
 
 
 def require_json(request: Request) -> None:
@@ -43,8 +58,9 @@ def require_json(request: Request) -> None:
     response_model=JobView,
     dependencies=[Depends(require_json)],
     responses={
-        201: {"headers": {"Location": {"description": "the job", "schema": {"type": "string"}}}},
+        **LOCATION,
         **responses(
+            "not-found",
             "body-too-large",
             "media-type",
             "invalid",
@@ -57,20 +73,17 @@ def require_json(request: Request) -> None:
     },
 )
 async def submit_job(
-    job: JobRequest,
+    job: AnyJob,
     context: Context,
     response: Response,
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            min_length=1,
-            max_length=200,
-            pattern=r"^[\x21-\x7e]+$",
-            description="the same key and job again give the job made before, also after a restart",
-        ),
-    ] = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> JobView:
-    """Store a job and queue it."""
+    """Store a job of any kind and queue it."""
+    return await submitted(job, context, response, idempotency_key)
+
+
+async def submitted(job: AnyJob, context: AppContext, response: Response, idempotency_key: str | None) -> JobView:
+    """Submit a job, and say in the response where it is."""
     record = await context.runner.submit(job, idempotency_key=idempotency_key)
     response.headers["Location"] = f"{PREFIX}/jobs/{record.id}"
     return JobView.of(record)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.engines import EngineInfo
 from app.events import EventMessage
+from app.job_documents import kind_of
 from storage.records import ActionRecord, JobRecord, JobState, LensRecord, LevelRecord, TableAction, TableSummary
 from storage.schemas import LevelDocument, ProvenanceDocument, level_to_document
 
@@ -24,11 +25,12 @@ class JobView(_View):
 
     id: str
     number: int = Field(description="counts jobs in the order of their creation")
+    kind: str = Field(description="what it does: calibrate, publish ...")
     state: JobState
     reason: str | None = Field(description="why it failed or was cancelled")
     lens: str
     engine: str
-    levels: int = Field(description="how many levels it has to measure")
+    levels: int = Field(description="how many levels it has to measure, as far as it is known; 0: none")
     created: datetime
     updated: datetime
     last_seq: int = Field(description="seq of its last event")
@@ -60,8 +62,10 @@ class JobDetail(JobView):
 
     @classmethod
     def build(cls, job: JobRecord, levels: Sequence[LevelRecord], table: TableSummary | None) -> Self:
+        fields = _job_fields(job)
+        planned = len({(level.result.zoom, level.result.focus) for level in levels})
         return cls(
-            **_job_fields(job),
+            **{**fields, "levels": max(fields["levels"], planned)},
             request=job.request,
             results=[LevelView.of(level) for level in levels],
             table_id=None if table is None else table.id,
@@ -72,6 +76,7 @@ def _job_fields(job: JobRecord) -> dict[str, Any]:
     return {
         "id": job.id,
         "number": job.number,
+        "kind": kind_of(job.request),
         "state": job.state,
         "reason": job.reason,
         "lens": job.lens,

@@ -19,9 +19,12 @@ from app.api.models import ActionList, ActionView, TableView
 from app.comparison import ComparisonDocument, compared
 from app.documents import Name
 from app.jobs.provenance import imported
+from app.lens_at import surface_fit
 from calibration.errors import CalibrationError, InvalidInput
+from calibration.surface import SurfaceFit
 from storage.errors import BadDocument
 from storage.exports import EXPORTS, Export
+from storage.schemas import PixelErrorDocument, SigmaDocument
 
 router = APIRouter(tags=["lenses"])
 
@@ -146,3 +149,84 @@ def _require_media_type(request: Request, export: Export) -> None:
     if given not in (export.media_type, RAW):
         told = f"send a {export.name} file as {export.media_type} or {RAW}"
         raise Problem("media-type", f"Content-Type is {given[:80]!r}; {told}")
+
+
+class LeftOutLevel(BaseModel):
+    """A level that does not fit its neighbours, or has no lens."""
+
+    model_config = ConfigDict(frozen=True)
+
+    zoom: float
+    focus: float
+    reason: str
+
+
+class LensAtView(BaseModel):
+    """The lens at a place, level or not, with one sigma of each quantity."""
+
+    model_config = ConfigDict(frozen=True)
+
+    zoom: float = Field(description="where it was read")
+    focus: float
+    clamped: bool = Field(description="whether that is not where it was asked for, which lies outside the levels")
+    fov_x_deg: float
+    fov_y_deg: float
+    f_px: float
+    k1: float
+    k2: float
+    k1_hw: float
+    k2_hw: float
+    center_shift_px: tuple[float, float]
+    nodal_offset_mm: float | None = Field(description="null: no level tells it")
+    sigma: SigmaDocument
+    predicted_overlay_px: PixelErrorDocument = Field(description="overlay error to expect there, one sigma")
+    left_out: list[LeftOutLevel] = Field(description="levels that the surface does not use, and why")
+
+    @classmethod
+    def of(cls, fit: SurfaceFit, zoom: float, focus: float) -> LensAtView:
+        """The lens of a surface at a place."""
+        found = fit.surface.at(zoom, focus)
+        lens, sigma = found.lens, found.sigma
+        return cls(
+            zoom=found.zoom,
+            focus=found.focus,
+            clamped=found.clamped,
+            fov_x_deg=lens.fov_x_deg,
+            fov_y_deg=lens.fov_y_deg,
+            f_px=lens.f_px,
+            k1=lens.k1,
+            k2=lens.k2,
+            k1_hw=lens.k1_hw,
+            k2_hw=lens.k2_hw,
+            center_shift_px=lens.center_shift_px,
+            nodal_offset_mm=lens.nodal_offset_mm if found.nodal_told else None,
+            sigma=SigmaDocument(
+                fov_x_deg=sigma.fov_x_deg,
+                k1=sigma.k1,
+                k2=sigma.k2,
+                center_shift_px=sigma.center_shift_px,
+                nodal_offset_mm=sigma.nodal_offset_mm,
+            ),
+            predicted_overlay_px=PixelErrorDocument(rms=found.predicted_px.rms, max=found.predicted_px.max),
+            left_out=[
+                LeftOutLevel(zoom=check.zoom, focus=check.focus, reason=check.reason or "")
+                for check in fit.checks
+                if not check.used
+            ],
+        )
+
+
+@router.get("/tables/{table_id}/at", response_model=LensAtView, responses=responses("not-found", "invalid"))
+async def lens_at_place(
+    table_id: Id,
+    context: Context,
+    zoom: Annotated[float, Query(ge=0, le=1, allow_inf_nan=False, description="encoder value, 0 wide to 1 tele")],
+    focus: Annotated[float, Query(ge=0, le=1, allow_inf_nan=False, description="encoder value, 0 infinity to 1 near")],
+) -> LensAtView:
+    """The lens at any zoom and focus, by one smooth fit over all levels of the table; held outside their range."""
+    record = await context.repository.get_table(table_id)
+    try:
+        fit = await asyncio.to_thread(surface_fit, record.table)
+    except CalibrationError as error:
+        raise Problem("not-comparable", f"the table's levels make no surface: {error}") from error
+    return LensAtView.of(fit, zoom, focus)

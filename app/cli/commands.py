@@ -19,6 +19,7 @@ from app.cli.demo import demo
 from app.cli.detect import detect
 from app.cli.doctor import doctor
 from app.cli.exports import export_table, import_table
+from app.cli.publish import publish
 from app.cli.run import run
 from app.cli.serve import serve
 from app.cli.simulate import simulate
@@ -115,6 +116,13 @@ cli.command(
     rich_help_panel=_TABLES,
     epilog=_examples("lensmatch tables", "lensmatch tables --database lensmatch-demo/lensmatch.db"),
 )(tables)
+cli.command(
+    rich_help_panel=_TABLES,
+    epilog=_examples(
+        "lensmatch publish table.json --studio studio.toml --room job.json",
+        "lensmatch publish table.json --zoom 0.5 --focus 0.25 --all-levels --room job.json",
+    ),
+)(publish)
 cli.command(
     rich_help_panel=_STUDIO, epilog=_examples("lensmatch serve", "lensmatch serve --port 8080 --profile studio.toml")
 )(serve)

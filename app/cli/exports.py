@@ -12,6 +12,7 @@ from app.cli.console import check_out, print_json, read_file, reported_errors, s
 from app.cli.tables import show_table
 from app.documents import DocumentError
 from app.jobs.provenance import imported
+from app.lens_at import table_at
 from calibration.tables import LensTable
 from storage.errors import BadDocument, CannotExport
 from storage.exports import EXPORTS, Export
@@ -103,7 +104,7 @@ def read_table_file(path: Path) -> LensTable:
 def _part(table: LensTable, zoom: float | None, focus: float | None) -> LensTable:
     """The levels of this zoom and of this focus; with both, the lens at that place."""
     if zoom is not None and focus is not None:
-        return _at(table, zoom, focus)
+        return table_at(table, zoom, focus)
     levels = tuple(level for level in table.levels if zoom in (None, level.zoom) and focus in (None, level.focus))
     if not levels:
         what, values = ("focus", {level.focus for level in table.levels})
@@ -112,15 +113,6 @@ def _part(table: LensTable, zoom: float | None, focus: float | None) -> LensTabl
         told = ", ".join(f"{value:g}" for value in sorted(values)[:20])
         raise CannotExport(f"no level has this {what}; the table has {what} {told}")
     return replace(table, levels=levels)
-
-
-def _at(table: LensTable, zoom: float, focus: float) -> LensTable:
-    """The table of one level, the lens at this place."""
-    level = table.level_at(zoom, focus)
-    if level is None:
-        told = ", ".join(f"{level.zoom:g} / {level.focus:g}" for level in table.levels[:20])
-        raise CannotExport(f"no level has zoom {zoom:g}, focus {focus:g}; the table has zoom / focus {told}")
-    return replace(table, levels=(level,))
 
 
 def _parse(path: Path, data: bytes, export: Export, fov_x_deg: float | None = None) -> LensTable:

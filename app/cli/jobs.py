@@ -55,7 +55,7 @@ async def run_job(settings: Settings, engines: Engines, request: JobRequest, sho
         for line in found:
             warn(line)
         if engine.dirty is not None:
-            warn(_by_hand(engine, engine.dirty))
+            warn(by_hand(engine, engine.dirty))
         record = await service.repository.get_job(record.id)
         results = [level.result for level in await service.repository.list_levels(record.id)]
         if interrupted:
@@ -81,7 +81,7 @@ def _kept(results: Sequence[LevelResult], job_id: str, settings: Settings) -> st
     return f" ({measured} finished levels of job {job_id} are kept in {settings.database})" if measured else ""
 
 
-def _by_hand(engine: EngineInfo, reason: str) -> str:
+def by_hand(engine: EngineInfo, reason: str) -> str:
     """What to put back by hand: this process ends, and with it the memory of the values."""
     values = ", ".join(f"{name} = {value}" for name, value in engine.found)
     return f"the engine's values could not be put back: {reason}; set by hand what it had: {values}"
@@ -98,7 +98,9 @@ async def _follow(service: Service, job_id: str, levels: int, show: Show) -> lis
                 seen = record.seq
                 event = message(record)
                 kind = event["kind"]
-                if kind == "level_started":
+                if kind == "levels_planned":
+                    levels = event["levels"]
+                elif kind == "level_started":
                     level, share = f"zoom {event['zoom']:.3g} focus {event['focus']:.3g}", 0.0
                 elif kind == "level_progress":
                     share = event["progress"]

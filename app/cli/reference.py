@@ -69,6 +69,10 @@ _DOCUMENTS = {
     "is not told",
     "`tables`": '`{"database":, "tables": [{"id":, "lens":, "camera":, "version":, "approved":, "created":, '
     '"job_id":, "sha256":, "provenance":}]}`',
+    "`publish`": '`{"published":, "zoom":, "focus":, "compared":, "render_px": {"rms":, "max":}, "reason":, "places": '
+    '[{"zoom":, "focus":, "values": [{"name":, "asked":, "got":, "same":}], "compared":, "renders":, "render_px":, '
+    '"limit_px":, "reason":, "ok":}], "job":}`, `null` what is not told; a publication that failed has `"error":` '
+    "besides",
     "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "

@@ -31,8 +31,8 @@ def simulate(
         typer.Option(
             metavar="SPEC",
             help="TARGET:KIND[=VALUE]@WHICH, repeatable. TARGET r3 or mockboard; KIND drop, late=SECONDS, split, "
-            "garbage, disconnect, and for mockboard stale, status=CODE; WHICH the number of the exchange, a range "
-            "4..6, or * for each",
+            "garbage, disconnect, for r3 clip=LIMIT, for mockboard stale, status=CODE; WHICH the number of the "
+            "exchange, a range 4..6, or * for each",
         ),
     ] = None,
     engine: Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 from app.documents import JobRequest
 from calibration.lens import Lens
@@ -24,6 +25,37 @@ def order(levels: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         focuses = sorted(by_zoom[zoom], reverse=index % 2 == 1)
         ordered += [(zoom, focus) for focus in focuses]
     return ordered
+
+
+class LevelPlan(Protocol):
+    """Which levels a job measures, and in which order: an ask/tell object, called in threads, one call at a time."""
+
+    def ask(self) -> list[tuple[float, float]]:
+        """The levels (zoom, focus) to measure next, in this order; empty: the plan is done.
+
+        Asked for again only when every level given before was told, failed ones too. The first answer has at least
+        one level.
+        """
+        ...
+
+    def tell(self, result: LevelResult) -> None:
+        """What came of a level that was asked for."""
+        ...
+
+
+class SweepPlan:
+    """Every level that was listed, in the order of :func:`order`."""
+
+    def __init__(self, levels: Sequence[tuple[float, float]]) -> None:
+        self._left = order(levels)
+
+    def ask(self) -> list[tuple[float, float]]:
+        """All of them, once."""
+        asked, self._left = self._left, []
+        return asked
+
+    def tell(self, result: LevelResult) -> None:
+        """Changes nothing: the levels were given."""
 
 
 def guess_from(done: Iterable[LevelResult], zoom: float, request: JobRequest) -> Lens | None:

@@ -23,7 +23,7 @@ from calibration.lens import Lens
 from calibration.solve.search import Capture, LevelTask, Observation, Source
 from calibration.types import DetectionResult, Picture, Refusal
 from engine_adapters.errors import AdapterError, BadPicture
-from engine_adapters.ports import EncodedFrame, HeadState, LensValues, Shown
+from engine_adapters.ports import EncodedFrame, HeadState, LensValues, ReadBack, Shown
 from engine_adapters.retry import Verdict, classify_head, classify_mockboard, classify_r3, retry
 
 T = TypeVar("T")
@@ -199,14 +199,23 @@ class PictureTaker:
         self.delay.change_made()
         self._must_change = True
 
+    async def apply(self, lens: Lens) -> None:
+        """Set the lens in the engine, if it is not the one set last."""
+        values = lens_values(lens)
+        if values != self._lens:
+            await self._again(lambda: self._studio.engine.apply(values), classify_r3)
+            self._lens = values
+            self.counters.changes += 1
+            self.delay.change_made()
+
+    async def read_back(self, lens: Lens) -> tuple[ReadBack, ...]:
+        """What the engine holds of a lens that was applied."""
+        values = lens_values(lens)
+        return await self._again(lambda: self._studio.engine.read_back(values), classify_r3)
+
     async def _set(self, capture: Capture) -> None:
         if capture.lens is not None:
-            values = lens_values(capture.lens)
-            if values != self._lens:
-                await self._again(lambda: self._studio.engine.apply(values), classify_r3)
-                self._lens = values
-                self.counters.changes += 1
-                self.delay.change_made()
+            await self.apply(capture.lens)
         await self._show(_SHOWN[capture.source])
 
     async def _show(self, shown: Shown) -> None:

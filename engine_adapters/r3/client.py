@@ -15,10 +15,10 @@ from enum import StrEnum
 from typing import Any, Self, TypeVar
 
 from engine_adapters.errors import AdapterError, ProtocolError, Refused, TimedOut, Unreachable, UnsafeText
-from engine_adapters.ports import EncodedFrame, EngineState, LensValues, Shown, TrackedCamera
+from engine_adapters.ports import EncodedFrame, EngineState, LensValues, ReadBack, Shown, TrackedCamera
 from engine_adapters.profile import R3Settings, StudioProfile
 from engine_adapters.r3 import commands
-from engine_adapters.r3.mapping import EngineMapping
+from engine_adapters.r3.mapping import EngineMapping, same_value
 from engine_adapters.r3.protocol import Command, Exchange, TimeoutClass
 
 T = TypeVar("T")
@@ -288,6 +288,14 @@ class R3Engine:
     async def read_lens(self) -> LensValues:
         """The lens as the engine gives it back."""
         return self._mapping.lens_from_engine({name: await self._get(name) for name in self._mapping.lens_exports})
+
+    async def read_back(self, values: LensValues) -> tuple[ReadBack, ...]:
+        """Each export of the lens, as it was to be set and as the engine gives it back. Sets nothing.
+
+        Raises ``UnsafeText`` for a lens that cannot be sent.
+        """
+        held = [(name, asked, await self._get(name)) for name, asked in self._mapping.lens_to_engine(values)]
+        return tuple(ReadBack(name, asked, got, same_value(asked, got)) for name, asked, got in held)
 
     async def show(self, shown: Shown) -> None:
         """Switch background and object in one MultiExport."""

@@ -16,6 +16,9 @@ from engine_adapters.ports import LensValues, Shown, TrackedCamera
 from engine_adapters.profile import EngineSettings, PictureSettings, R3Settings, StudioProfile
 from engine_adapters.r3.commands import number_text
 
+_KEPT, _LOST = 1e-6, 1e-4
+# Relative differences of a value read back: of one that was kept, and the most that an engine's few decimals excuse.
+
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -160,6 +163,22 @@ class EngineMapping:
 
     def _nodal_scale(self) -> float:
         return 0.001 if self.engine.nodal_unit == "m" else 1.0
+
+
+def same_value(asked: str, got: str) -> bool:
+    """Whether an engine that was told ``asked`` and gives ``got`` back holds the value.
+
+    Equal to a millionth, which an engine with single precision keeps; or to half of the last decimal that the engine
+    writes, as long as that loses no more than a ten-thousandth of the value.
+    """
+    try:
+        wanted, held = float(asked), float(got)
+    except ValueError:
+        return False
+    mantissa, _, exponent = got.strip().lower().partition("e")
+    decimals = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    written = min(0.5 * 10.0 ** -max(decimals, 0), _LOST * abs(wanted))
+    return abs(held - wanted) <= max(_KEPT * abs(wanted), written * (1 + 1e-9))
 
 
 def _read_number(exports: Mapping[str, str], name: str) -> float:

@@ -7,6 +7,7 @@ A specification is ``TARGET:KIND[=VALUE]@WHICH``. TARGET: ``r3`` or ``mockboard`
 - ``late=SECONDS``: the answer comes that much later;
 - ``split``: the answer comes in small pieces;
 - ``garbage``: nonsense instead of the answer;
+- ``clip=LIMIT`` (r3): k1 and k2 set in it are kept within -LIMIT and LIMIT, though the answer says they were set;
 - ``disconnect``: the first half of the answer, then the connection is closed;
 - ``stale`` (mockboard): the picture of the exchange before once more;
 - ``status=CODE`` (mockboard): an HTTP error.
@@ -36,14 +37,19 @@ class FaultKind(StrEnum):
     DROP = "drop"
     LATE = "late"
     SPLIT = "split"
+    CLIP = "clip"
     GARBAGE = "garbage"
     DISCONNECT = "disconnect"
     STALE = "stale"
     STATUS = "status"
 
 
-_WITH_VALUE = {FaultKind.LATE: (0.0, 600.0), FaultKind.STATUS: (400, 599)}
-_MOCKBOARD_ONLY = {FaultKind.STALE, FaultKind.STATUS}
+_WITH_VALUE = {FaultKind.LATE: (0.0, 600.0), FaultKind.STATUS: (400, 599), FaultKind.CLIP: (0.0, 1e6)}
+_ONE_SERVER = {
+    FaultKind.STALE: FaultTarget.MOCKBOARD,
+    FaultKind.STATUS: FaultTarget.MOCKBOARD,
+    FaultKind.CLIP: FaultTarget.R3,
+}
 _SPEC = re.compile(
     r"(?P<target>[a-z0-9]+):(?P<kind>[a-z]+)(=(?P<value>[^@]+))?@(?P<which>\*|[0-9]{1,9}(\.\.[0-9]{1,9})?)"
 )
@@ -81,8 +87,8 @@ def parse_fault(spec: str) -> Fault:
     except ValueError as error:
         known = ", ".join(FaultKind)
         raise SimulatorError(f"no fault is called {match['kind']}; there are {known}", where=where) from error
-    if kind in _MOCKBOARD_ONLY and target is not FaultTarget.MOCKBOARD:
-        raise SimulatorError(f"{kind} is a fault of the mockboard only", where=where)
+    if _ONE_SERVER.get(kind, target) is not target:
+        raise SimulatorError(f"{kind} is a fault of the {_ONE_SERVER[kind]} only", where=where)
     value = _value(kind, match["value"], where)
     if match["which"] == "*":
         return Fault(target, kind, 1, None, value)

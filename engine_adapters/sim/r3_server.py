@@ -20,13 +20,14 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import math
 import re
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
 from engine_adapters.sim.camera_output import CameraOutput, PictureFormat, encode_picture
-from engine_adapters.sim.faults import FaultPlan, FaultTarget
+from engine_adapters.sim.faults import FaultKind, FaultPlan, FaultTarget
 from engine_adapters.sim.studio import OutputState, Studio, StudioError
 from engine_adapters.sim.wire import deliver
 
@@ -80,12 +81,13 @@ class R3Engine:
             if not command:
                 continue
             fault = self._faults.next(FaultTarget.R3)
-            replies = await self.answer(command)
+            clip = fault.value if fault is not None and fault.kind is FaultKind.CLIP else math.inf
+            replies = await self.answer(command, clip)
             if not await deliver(writer, "".join(reply + "\n" for reply in replies).encode(), fault):
                 return
 
-    async def answer(self, command: bytes) -> list[str]:
-        """The reply lines to one command line (without its line ending)."""
+    async def answer(self, command: bytes, clip: float = math.inf) -> list[str]:
+        """The reply lines to one command line (without its line ending). ``clip``: k1 and k2 are kept within it."""
         try:
             words = _words(command.decode("utf-8"))
         except UnicodeDecodeError:
@@ -98,7 +100,7 @@ class R3Engine:
             case [("engine.tracking", False), (camera, True), ("get", False)]:
                 return [self._tracking(camera)]
             case [("scene", False), (scene, True), ("export", False), *rest]:
-                return self._export(scene, rest)
+                return self._export(scene, rest, clip)
         return [_UNKNOWN]
 
     def _tracking(self, camera: str) -> str:
@@ -107,7 +109,7 @@ class R3Engine:
         except StudioError as error:
             return f"ERROR: TRACKING - {error}"
 
-    def _export(self, scene: str, words: list[tuple[str, bool]]) -> list[str]:
+    def _export(self, scene: str, words: list[tuple[str, bool]], clip: float) -> list[str]:
         match words:
             case [(name, True), ("getValue", False)]:
                 try:
@@ -128,10 +130,13 @@ class R3Engine:
                     replies.append((name, value))
                 case _:
                     return [_UNKNOWN]
-        return [self._set_value(scene, name, value) for name, value in replies] or [_UNKNOWN]
+        return [self._set_value(scene, name, value, clip) for name, value in replies] or [_UNKNOWN]
 
-    def _set_value(self, scene: str, name: str, value: str) -> str:
+    def _set_value(self, scene: str, name: str, value: str, clip: float) -> str:
+        names = self._studio.setup.names
         try:
+            if clip < math.inf and name in (names.k1, names.k2):
+                value = _clipped(value, clip)
             self._studio.set_value(scene, name, value)
         except StudioError as error:
             return f"ERROR: SCENE EXPORT SETVALUE - {error}"
@@ -189,6 +194,15 @@ class R3Engine:
             return None
         path = self._projects / (name if name.lower().endswith(".png") else f"{name}.png")
         return path if path.parent == self._projects else None
+
+
+def _clipped(value: str, limit: float) -> str:
+    """A number's text within -limit and limit; what is no number is left for the studio to refuse."""
+    try:
+        number = float(value)
+    except ValueError:
+        return value
+    return value if abs(number) <= limit else f"{math.copysign(limit, number):.12g}"
 
 
 def _words(line: str) -> list[tuple[str, bool]]:

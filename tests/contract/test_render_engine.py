@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from typing import Any
 
 import pytest
@@ -28,6 +28,19 @@ async def test_the_lens_reads_back_as_it_was_set(on_engine: RunCheck) -> None:
         for values in (LENS, PLAIN):
             await engine.apply(values)
             assert flat(await engine.read_lens()) == pytest.approx(flat(values), rel=1e-12, abs=1e-12)
+
+    await on_engine(check)
+
+
+async def test_each_value_of_the_lens_reads_back_with_its_export(on_engine: RunCheck) -> None:
+    async def check(engine: RenderEngine) -> None:
+        await engine.apply(LENS)
+        held = await engine.read_back(LENS)
+        assert [back.name for back in held if not back.same] == []
+        state = dict((await engine.read_state()).exports)
+        assert {back.name: back.got for back in held} == {back.name: state[back.name] for back in held}
+        other = await engine.read_back(replace(LENS, k1=-0.2))
+        assert [(back.same, float(back.asked) != float(back.got)) for back in other].count((False, True)) == 1
 
     await on_engine(check)
 

@@ -15,7 +15,13 @@ from app.reference import pages
 
 def test_the_reference_is_current(repository: Path) -> None:
     made = pages()
-    assert {"openapi.json", "events.schema.json", "job.schema.json", "picture-set.schema.json"} <= made.keys()
+    assert {
+        "openapi.json",
+        "events.schema.json",
+        "job.schema.json",
+        "publish.schema.json",
+        "picture-set.schema.json",
+    } <= made.keys()
     for name, text in made.items():
         written = (repository / "docs" / "reference" / name).read_text("utf-8")
         assert written == text, f"{name}: run python -m app.reference docs/reference"

@@ -32,7 +32,7 @@ from tests.support.service import JOB, KeepingRunner, assert_problem, stored_job
         ("POST", "/api/v1/jobs/none/pause", "not-found"),
         ("POST", "/api/v1/jobs/none/resume", "not-found"),
         ("POST", "/api/v1/tables/1/approve", "not-found"),
-        ("POST", "/api/v1/tables/1/publish", "not-found"),
+        ("POST", "/api/v1/tables/1/publish", "media-type"),
         ("GET", "/api/v1/lenses/1/tables", "not-found"),
         ("GET", "/api/v1/tables/1", "not-found"),
         ("PUT", "/api/v1/jobs", "method-not-allowed"),

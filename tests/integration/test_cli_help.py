@@ -52,7 +52,19 @@ def test_every_command_has_help_with_its_options_and_examples(command: str, monk
 
 
 def test_the_contracts_commands_are_there() -> None:
-    wanted = {"demo", "serve", "simulate", "calibrate", "run", "detect", "export", "import", "bench", "doctor"}
+    wanted = {
+        "demo",
+        "serve",
+        "simulate",
+        "calibrate",
+        "run",
+        "detect",
+        "export",
+        "import",
+        "publish",
+        "bench",
+        "doctor",
+    }
     assert wanted <= set(COMMANDS)
 
 

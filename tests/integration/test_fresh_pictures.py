@@ -24,7 +24,7 @@ from calibration.image import Transfer
 from calibration.solve.search import Capture, LevelTask, Observation, Source
 from calibration.tables import LevelResult
 from calibration.types import Target, TargetKind, TargetPose
-from engine_adapters.ports import EncodedFrame, EngineState, HeadState, LensValues, Shown, TrackedCamera
+from engine_adapters.ports import EncodedFrame, EngineState, HeadState, LensValues, ReadBack, Shown, TrackedCamera
 
 SIZE = (128, 72)
 PICTURE_S = 0.002
@@ -71,6 +71,9 @@ class DelayedStudio:
 
     async def read_lens(self) -> LensValues:
         return LensValues(50.0)
+
+    async def read_back(self, values: LensValues) -> tuple[ReadBack, ...]:
+        raise AssertionError("taking a picture must not read values back")
 
     async def read_state(self) -> EngineState:
         return EngineState(())

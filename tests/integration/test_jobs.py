@@ -17,10 +17,11 @@ from app.documents import JobRequest
 from app.engines import StudioMismatch, UnknownEngine
 from app.errors import QueueFull
 from app.events import TERMINAL_KINDS, JobQueued, draft
+from app.jobs import calibrating
 from app.jobs.provenance import inputs_sha256
 from app.settings import Settings
 from calibration.compare import overlay
-from calibration.tables import LevelStatus
+from calibration.tables import LevelResult, LevelStatus
 from engine_adapters.profile import profile_sha256
 from engine_adapters.r3.client import R3Engine
 from engine_adapters.sim.launch import launched_studio
@@ -125,6 +126,38 @@ async def test_a_job_measures_its_levels_and_leaves_the_engine_as_it_was(tmp_pat
         assert [event.seq for event in events] == list(range(1, len(events) + 1))
         kinds = [event.kind for event in events]
         assert kinds.index("engine_restored") < kinds.index("job_done") == len(kinds) - 1
+
+
+class GrowingPlan:
+    """One level, then another that nobody listed."""
+
+    def __init__(self) -> None:
+        self.left = [[(0.5, 0.25)], [(0.5, 0.75)]]
+        self.told: list[LevelResult] = []
+
+    def ask(self) -> list[tuple[float, float]]:
+        return self.left.pop(0) if self.left else []
+
+    def tell(self, result: LevelResult) -> None:
+        self.told.append(result)
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_plan_may_ask_for_more_levels_than_the_job_lists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = GrowingPlan()
+    monkeypatch.setattr(calibrating, "make_plan", lambda request: plan)
+    async with bench(tmp_path / "jobs.db") as b:
+        record = await b.service.runner.submit(b.job((0.5, 0.25)))
+        planned = await b.until(record.id, "levels_planned")
+        assert planned.data["levels"] == 2
+        assert (await b.ended(record.id)).kind == "job_done"
+        levels = await b.service.repository.list_levels(record.id)
+        assert [(level.result.zoom, level.result.focus) for level in levels] == [(0.5, 0.25), (0.5, 0.75)]
+        assert [(told.zoom, told.focus, told.status) for told in plan.told] == [
+            (level.result.zoom, level.result.focus, LevelStatus.OK) for level in levels
+        ]
 
 
 @pytest.mark.timeout(ENOUGH_TIME_S)

@@ -114,6 +114,30 @@ async def test_a_job_is_posted_watched_and_downloaded(lensmatch: Any) -> None:
             assert picture.headers["content-type"] == "image/jpeg", picture.text
 
 
+async def test_the_table_of_a_job_is_published_and_stays_in_the_engine(lensmatch: Any) -> None:
+    async with studio(lensmatch.folder) as (addresses, engine), service(lensmatch) as client:
+        found = dict((await engine.read_state()).exports)
+        made = await client.post(addresses, (1 / 6, 0.25))
+        assert [event["kind"] async for event in client.events(made)][-1] == "job_done"
+        table_id = (await client.job(made))["table_id"]
+        place = {"zoom": 1 / 6, "focus": 0.25}
+        answer = await client.http.post(f"/api/v1/tables/{table_id}/publish", json=place)
+        assert answer.status_code == 201, answer.text
+        job_id = answer.headers["location"].rpartition("/")[2]
+        events = [event async for event in client.events(job_id)]
+        assert events[-1]["kind"] == "job_done", events[-1]
+        (published,) = [event for event in events if event["kind"] == "published"]
+        assert published["kept"]
+        assert published["compared"]
+        assert published["render_px"]["max"] < 0.15
+        now = dict((await engine.read_state()).exports)
+        assert {value["name"]: value["got"] for value in published["values"]}.items() <= now.items()
+        assert {name for name in found if found[name] != now[name]} <= {value["name"] for value in published["values"]}
+        lens = true_lens(LENS, 1 / 6, 0.25)
+        assert (await engine.read_lens()).fov_x_deg == pytest.approx(lens.fov_x_deg, rel=1e-3)
+        assert (await client.job(job_id))["kind"] == "publish"
+
+
 async def test_a_cancelled_job_gives_the_engine_back_as_it_was_found(lensmatch: Any) -> None:
     async with studio(lensmatch.folder) as (addresses, engine), service(lensmatch) as client:
         found = await engine.read_state()

@@ -8,10 +8,11 @@ from typing import Any
 import httpx
 
 from app.api import errors
-from app.documents import JobRequest
 from app.engines import EngineInfo, UnknownEngine
 from app.errors import QueueFull
-from app.events import JobCancelled, JobQueued, JobStarted, LevelDone, draft
+from app.events import JobCancelled, JobStarted, LevelDone, draft
+from app.job_documents import AnyJob
+from app.jobs.kinds import queued, subject_of
 from calibration.lens import Lens
 from calibration.tables import EVIDENCE_QUANTITIES, LensTable, LevelResult, PixelError
 from storage.records import JobRecord, JobState, PictureKind
@@ -36,20 +37,15 @@ class KeepingRunner:
         self._ledger = ledger
         self.full = False
 
-    async def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobRecord:
+    async def submit(self, request: AnyJob, *, idempotency_key: str | None = None) -> JobRecord:
         if request.engine != "default":
             raise UnknownEngine(f"no engine is called {request.engine!r}; this service knows: default")
         if self.full:
             raise QueueFull(3, retry_after_s=7)
-        queued = JobQueued(
-            lens=request.lens,
-            camera=request.camera,
-            engine=request.engine,
-            method=request.method,
-            levels=len(request.levels),
-        )
+        about = await subject_of(request, self._ledger)
         body = request.model_dump(mode="json")
-        return await self._ledger.create_job(body, request.lens, request.engine, idempotency_key, draft(queued))
+        event = draft(queued(request, about))
+        return await self._ledger.create_job(body, about.lens, request.engine, idempotency_key, event)
 
     async def cancel(self, job_id: str) -> JobRecord:
         job = await self._ledger.get_job(job_id)

@@ -38,6 +38,7 @@ RESULT = LevelResult.from_lens(
 SAMPLES: list[events.AnyEvent] = [
     events.JobQueued(lens="XA 20x", camera="Cam0", engine="default", method="joint", levels=13),
     events.JobStarted(engine="default", levels=13),
+    events.LevelsPlanned(levels=15),
     events.LevelStarted(**PLACE),
     events.CaptureAsked(**PLACE, step=0, source="real", target="board", pan_deg=-3.5, tilt_deg=0.0),
     events.TargetFound(**PLACE, step=0, points=49, blur_px=1.5),
@@ -48,6 +49,16 @@ SAMPLES: list[events.AnyEvent] = [
     events.EngineLearned.of(
         "default", LearnedEngine(EngineModel(), True, 0.004, math.inf, 0.02, 8), ("engine.direction says a, not b",)
     ),
+    events.PlaceChecked(
+        **PLACE,
+        values=(events.ValueData(name="lens.k1", asked="-0.12", got="-0.12", same=True),),
+        compared=True,
+        renders=3,
+        render_px=events.PixelErrorData(rms=0.02, max=0.06),
+        limit_px=0.15,
+        ok=True,
+    ),
+    events.Published(engine="default", table_id=3, zoom=0.5, focus=1.0, kept=True, compared=True, places=1),
     events.EngineRestored(engine="default"),
     events.EngineDirty(engine="default", reason="the engine is gone"),
     events.JobDone(table_id=7),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from engine_adapters.errors import ProtocolError, UnsafeText
 from engine_adapters.ports import LensValues, Shown
 from engine_adapters.profile import EngineSettings, PictureSettings, R3Settings, StudioProfile
-from engine_adapters.r3.mapping import EngineMapping
+from engine_adapters.r3.commands import number_text
+from engine_adapters.r3.mapping import EngineMapping, same_value
 
 # docs: conventions.md and protocols/README.md, "Test vector".
 GOLDEN = LensValues(71.262261, k1=-0.191619, k2=0.0689969, center_shift_px=(3.0, -2.0), nodal_offset_mm=121.3)
@@ -184,6 +186,38 @@ def test_a_value_that_is_no_lens_is_told_with_its_export(name: str, text: str, t
     exports = dict(mapping().lens_to_engine(GOLDEN)) | {name: text}
     with pytest.raises(ProtocolError, match=f"{name} = .*{told}"):
         mapping().lens_from_engine(exports)
+
+
+@pytest.mark.parametrize(
+    ("asked", "got", "same"),
+    [
+        ("-0.191619", "-0.191619", True),
+        ("-0.191619", "-1.9161900e-1", True),
+        ("-0.191619", "-0.19161899", True),  # single precision
+        ("963.81", "963.81", True),
+        ("71.262261000000000", "71.26226", True),
+        ("71.262261", "71.2620", False),  # a digit cut off, not rounded
+        ("-0.191619", "-0.19", False),  # rounded, but too much is lost
+        ("1.3", "1", False),
+        ("0.0", "0", True),
+        ("0.0", "0.00001", False),
+        ("3.0", "-3.0", False),
+        ("3.0", "nan", False),
+        ("3.0", "inf", False),
+        ("3.0", "on", False),
+        ("3.0", "", False),
+        ("0.0", "0e400", True),
+    ],
+)
+def test_a_value_read_back_is_the_same_within_the_engines_digits(asked: str, got: str, same: bool) -> None:
+    assert same_value(asked, got) is same
+
+
+@given(st.floats(-1e6, 1e6).filter(lambda value: abs(value) > 1e-9))
+def test_single_precision_keeps_a_value_and_a_clipped_one_is_seen(value: float) -> None:
+    asked = number_text("k1", value)
+    assert same_value(asked, repr(float(np.float32(value))))
+    assert not same_value(asked, number_text("k1", value * 1.001))
 
 
 def test_a_missing_value_is_told() -> None:
