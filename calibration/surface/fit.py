@@ -109,7 +109,7 @@ def find_outliers(data: LevelData, prior: PriorMean | None) -> dict[int, tuple[L
         for place in suspects:
             level = kept[int(place)]
             # The smoothness is learned again without it: with it, a wrong level makes every lens look rough.
-            others = LensModel.fit(data.only([i for i in kept if i != level]), prior, like=model)
+            others = LensModel.fit(data.only([i for i in kept if i != level]), prior)
             found = against(others, data, level)
             chance = chance_of(found, others.spare)
             if worst is None or chance < worst[0]:
