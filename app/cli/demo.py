@@ -36,11 +36,13 @@ from app.cli.simulated import (
     true_lens,
 )
 from app.cli.tables import tell_failed
+from app.documents import PlanModel
+from app.lens_at import surface_fit
 from app.report import LevelReport, RunReport, write_report
 from app.settings import Settings
 from calibration.compare import Overlay, overlay
 from calibration.lens import Lens
-from calibration.tables import LevelResult
+from calibration.tables import LensTable, LevelResult
 from engine_adapters.sim.launch import launched_studio
 from engine_adapters.sim.lens_truth import ZoomLens, embedded_lens_names, load_embedded
 from storage.evidence import EVIDENCE_FILE, evidence_file
@@ -50,6 +52,11 @@ from storage.schemas import table_to_document
 PICTURE_TIME_MS = 15.0
 DELAY_FRAMES = 2
 GOAL_PX = 0.15
+
+
+_MOST_PLANNED = 25
+_BETWEEN = 101
+# Places along the zoom at which a planned table is compared with the truth.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +72,10 @@ def demo(
     lens: Annotated[str, typer.Option(help="which simulated lens; see --list-lenses")] = embedded_lens_names()[0],
     zooms: Annotated[int, typer.Option(min=1, max=100, help="zoom levels from wide to tele")] = STUDY_ZOOMS,
     focuses: Annotated[int, typer.Option(min=1, max=20, help="focus levels for each zoom")] = STUDY_FOCUSES,
+    accuracy: Annotated[
+        float | None,
+        typer.Option(metavar="PX", help="choose the levels until so much is reached between them, instead of a grid"),
+    ] = None,
     out: Annotated[Path, typer.Option(help="folder for the lens table and the report")] = Path("lensmatch-demo"),
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON document on standard output")] = False,
     list_lenses: Annotated[bool, typer.Option(help="print the simulated lenses and stop")] = False,
@@ -84,10 +95,14 @@ def demo(
             wrong_usage(f"no simulated lens is called {lens!r}; there are: {', '.join(embedded_lens_names())}")
         out.mkdir(parents=True, exist_ok=True)
         truth = load_embedded(lens)
-        levels = study_levels(zooms, focuses)
+        if accuracy is not None and not accuracy > 0:
+            wrong_usage(f"--accuracy {accuracy:g}: must be more than 0 px")
+        # At one focus: how far a lens breathes between two is no question of its zoom.
+        plan = PlanModel(accuracy_px=accuracy, max_levels=_MOST_PLANNED) if accuracy is not None else None
+        levels = study_levels(zooms, focuses) if plan is None else []
         started = time.monotonic()
         with progress_bar("demo") as show:
-            job, use = asyncio.run(_run(truth, levels, out, show))
+            job, use = asyncio.run(_run(truth, levels, plan, out, show))
         seconds = time.monotonic() - started
         judged = [_judge(result, truth, job) for result in job.table.levels]
         for name in ("json", "csv"):
@@ -116,6 +131,8 @@ def demo(
             print_json(_document(job, truth, judged, use, seconds))
         else:
             _show(judged, use, seconds, out)
+            if plan is not None:
+                _show_between(job.table, truth)
 
 
 def _key(result: LevelResult) -> tuple[float, float]:
@@ -123,7 +140,7 @@ def _key(result: LevelResult) -> tuple[float, float]:
 
 
 async def _run(
-    truth: ZoomLens, levels: list[tuple[float, float]], out: Path, show: Show
+    truth: ZoomLens, levels: list[tuple[float, float]], plan: PlanModel | None, out: Path, show: Show
 ) -> tuple[FinishedJob, StudioUse]:
     show(0.0, "starting the simulated studio")
     settings = Settings(database=out / "lensmatch.db")
@@ -136,7 +153,7 @@ async def _run(
     ]
     async with launched_studio(options) as addresses:
         engines = studio_engines(studio_profile(addresses, truth))
-        job = await run_job(settings, engines, studio_job(addresses, truth, levels), show)
+        job = await run_job(settings, engines, studio_job(addresses, truth, levels, plan=plan), show)
         return job, await studio_use(addresses, PICTURE_TIME_MS / 1000, DELAY_FRAMES)
 
 
@@ -207,6 +224,21 @@ def _show(judged: list[Judged], use: StudioUse, seconds: float, out: Path) -> No
         f"({use.pictures} pictures, {use.changes} values set, {use.movements} movements of {use.movements_s:.1f} s)"
     )
     say(f"lens table: {out / 'lens-table.json'} and .csv   report: {out / 'report.html'}")
+
+
+def _show_between(table: LensTable, truth: ZoomLens) -> None:
+    """How far the lens is off between the levels: the truth is looked at here, after everything was measured."""
+    fit = surface_fit(table)
+    (wide, tele), focus = fit.surface.zoom_range, fit.surface.focus_range[0]
+    places = [wide + (tele - wide) * i / (_BETWEEN - 1) for i in range(_BETWEEN)]
+    read = [fit.surface.at(zoom, focus) for zoom in places]
+    errors = [
+        overlay(true_lens(truth, zoom, focus), found.lens).max_px for zoom, found in zip(places, read, strict=True)
+    ]
+    results.print(
+        f"between the levels at most [bold]{max(errors):.3f} px[/] off, at {_BETWEEN} places; "
+        f"{max(found.predicted_px.max for found in read):.3f} px were expected"
+    )
 
 
 def _add_rows(table: Table, j: Judged) -> None:

@@ -110,6 +110,8 @@ async def _follow(service: Service, job_id: str, levels: int, show: Show) -> lis
                     found += event["disagreements"]
                     if not event["trusted"]:
                         found.append(f"the engine's camera was not learned: {event['reason']}")
+                # A plan adds levels as it goes; before it has asked for any there are none to count.
+                levels = max(levels, done + 1)
                 doing = f"level {min(done + 1, levels)}/{levels}: {level}" if level else "measuring the output's delay"
                 show((done + share) / levels, doing)
                 if kind in TERMINAL_KINDS:

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 
 from app.bootstrap import DEFAULT_ENGINE, add_engine
-from app.documents import JobRequest
+from app.documents import JobRequest, PlanModel
 from app.engines import Engines
 from calibration.lens import Lens
 from engine_adapters.profile import StudioProfile, parse_profile, profile_toml
@@ -87,9 +87,16 @@ def studio_engines(profile: StudioProfile, *, slow_pictures: bool = False) -> En
 
 
 def studio_job(
-    addresses: dict[str, Any], lens: ZoomLens, levels: Sequence[tuple[float, float]], method: str = "joint"
+    addresses: dict[str, Any],
+    lens: ZoomLens,
+    levels: Sequence[tuple[float, float]],
+    method: str = "joint",
+    plan: PlanModel | None = None,
 ) -> JobRequest:
-    """A job from the room's survey: what an operator with a tape measure would write down. No truth of the lens."""
+    """A job from the room's survey: what an operator with a tape measure would write down. No truth of the lens.
+
+    ``plan`` instead of ``levels``: it chooses them.
+    """
     survey = addresses["survey"]
     return JobRequest.model_validate(
         {
@@ -101,6 +108,7 @@ def studio_job(
             "sensor_mm": list(lens.sensor_mm),
             "pixel_aspect": lens.pixel_aspect,
             "levels": [{"zoom": zoom, "focus": focus} for zoom, focus in levels],
+            "plan": plan,
             "targets": survey["targets"],
             "pivot_m": survey["pivot_m"],
         }
