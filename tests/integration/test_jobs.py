@@ -13,12 +13,13 @@ import pytest
 
 from app.bootstrap import Service, running_service
 from app.cli.simulated import studio_engines, studio_job, studio_profile, true_lens
-from app.documents import JobRequest
+from app.documents import JobRequest, PlanModel
 from app.engines import StudioMismatch, UnknownEngine
 from app.errors import QueueFull
 from app.events import TERMINAL_KINDS, JobQueued, draft
 from app.jobs import calibrating
 from app.jobs.provenance import inputs_sha256
+from app.lens_at import surface_fit
 from app.settings import Settings
 from calibration.compare import overlay
 from calibration.tables import LevelResult, LevelStatus
@@ -130,6 +131,8 @@ async def test_a_job_measures_its_levels_and_leaves_the_engine_as_it_was(tmp_pat
 
 class GrowingPlan:
     """One level, then another that nobody listed."""
+
+    reason: str | None = None
 
     def __init__(self) -> None:
         self.left = [[(0.5, 0.25)], [(0.5, 0.75)]]
@@ -321,3 +324,53 @@ async def test_a_restart_takes_up_what_was_queued_and_ends_what_ran(tmp_path: Pa
             assert stopped.state is JobState.FAILED
             assert "finished levels are kept" in (stopped.reason or "")
             assert (await b.ended(second.id)).kind == "job_done"
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_plan_chooses_the_levels_and_says_why_it_ends(tmp_path: Path) -> None:
+    async with bench(tmp_path / "jobs.db") as b:
+        plan = PlanModel(accuracy_px=1e-3, max_levels=6, zoom_range=(0.0, 0.5), focus_range=(0.25, 0.25))
+        record = await b.service.runner.submit(studio_job(b.addresses, LENS, [], plan=plan))
+        assert (await b.ended(record.id)).kind == "job_done"
+        events = await b.service.repository.events_after(record.id, 0)
+        planned = [event.data["levels"] for event in events if event.kind == "levels_planned"]
+        assert planned == [5, 6]
+        notes = [event.data["text"] for event in events if event.kind == "note"]
+        assert any("the plan ends: 6 levels are measured" in note for note in notes)
+        summary = await b.service.repository.table_of_job(record.id)
+        assert summary is not None
+        table = (await b.service.repository.get_table(summary.id)).table
+        assert len(table.levels) == 6
+        assert (table.levels[0].zoom, table.levels[-1].zoom) == (0.0, 0.5)
+        assert table.interpolation is not None
+        assert table.interpolation.held_out_px is not None
+        between = surface_fit(table).surface.at(0.3, 0.25)
+        assert overlay(true_lens(LENS, 0.3, 0.25), between.lens).max_px < 1.0
+
+
+@pytest.mark.timeout(ENOUGH_TIME_S)
+async def test_a_level_that_is_asked_for_again_is_a_further_attempt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Twice:
+        reason: str | None = "asked twice"
+
+        def __init__(self) -> None:
+            self.left = [[(0.5, 0.25)], [(0.5, 0.25)]]
+
+        def ask(self) -> list[tuple[float, float]]:
+            return self.left.pop(0) if self.left else []
+
+        def tell(self, result: LevelResult) -> None:
+            pass
+
+    monkeypatch.setattr(calibrating, "make_plan", lambda *arguments: Twice())
+    async with bench(tmp_path / "jobs.db") as b:
+        record = await b.service.runner.submit(b.job((0.5, 0.25)))
+        assert (await b.ended(record.id)).kind == "job_done"
+        stored = await b.service.repository.list_levels(record.id)
+        assert [(level.ordinal, level.attempt) for level in stored] == [(0, 1), (0, 2)]
+        summary = await b.service.repository.table_of_job(record.id)
+        assert summary is not None
+        table = (await b.service.repository.get_table(summary.id)).table
+        assert table.levels == (stored[1].result,)
