@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from app.plots.sheet import (
     FAILED,
@@ -18,6 +20,7 @@ from app.plots.sheet import (
     SOFT,
     ZOOM,
     Sheet,
+    alone,
     fit_of,
     line_colours,
     log_ticks,
@@ -32,6 +35,7 @@ BAND_SIGMAS = 1.96
 """Half the width of bands and error bars, in sigmas: they hold 95 %."""
 _STEPS = 161
 _SAME = 1e-6
+_CROSS_ROOM = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +94,7 @@ def lines(
 ) -> None:
     """A panel for each quantity over zoom, or over focus, and their common legend under them."""
     points = _Points.of(table, fit, over_focus)
-    shown: dict[str, object] = {}
+    shown: dict[str, Artist] = {}
     for axes, quantity in zip(panels, quantities, strict=True):
         axes.set_title(quantity.title)
         axes.set_xlabel(FOCUS if over_focus else ZOOM)
@@ -173,8 +177,7 @@ def _panel(axes: Axes, quantity: Quantity, points: _Points, surface: LensSurface
     told = np.array([quantity.told(level) for level in points.levels])
     left_out = told & (points.used == 0)
     if left_out.any():
-        at = (points.along[left_out], points.values[left_out, column])
-        axes.plot(*at, "X", color=FAILED, markersize=9, markeredgecolor="white", label="left out of the fit", zorder=6)
+        _crosses(axes, points.along[left_out], points.values[left_out, column])
     if points.failed:
         axes.plot(
             points.failed,
@@ -186,14 +189,34 @@ def _panel(axes: Axes, quantity: Quantity, points: _Points, surface: LensSurface
             label="level without a lens",
             clip_on=False,
         )
+    alone(axes, points.along)
     if column == 0:
         log_ticks(axes, np.concatenate([points.values[:, 0], *seen]))
     elif min(axes.get_ylim()) < 0 < max(axes.get_ylim()):
         axes.axhline(0, color=SOFT, linewidth=0.8, alpha=0.6, zorder=1)
 
 
+def _crosses(axes: Axes, along: FloatArray, values: FloatArray) -> None:
+    """Levels left out; one far outside stands at the border with its value: it would press the others together."""
+    low, high = axes.get_ylim()
+    room = _CROSS_ROOM * (high - low)
+    inside = np.clip(values, low - room, high + room)
+    axes.plot(
+        along, inside, "X", color=FAILED, markersize=9, markeredgecolor="white", label="left out of the fit", zorder=6
+    )
+    for x, y, value in zip(along, inside, values, strict=True):
+        if y != value:
+            axes.annotate(f"{value:.3g}", (x, y), (8, 0), textcoords="offset points", color=FAILED, va="center")
+
+
 def _dots(
-    axes: Axes, quantity: Quantity, points: _Points, column: int, here: FloatArray, colour: str, label: str | None
+    axes: Axes,
+    quantity: Quantity,
+    points: _Points,
+    column: int,
+    here: NDArray[np.bool_],
+    colour: str,
+    label: str | None,
 ) -> None:
     """Levels as points, with a bar where their sigma is stated."""
     told = np.array([quantity.told(level) for level in points.levels]) & here & (points.used > 0)

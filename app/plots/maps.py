@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import LogLocator
 
 from app.lens_at import lens_at
 from app.plots import curves
@@ -19,6 +19,7 @@ from app.plots.sheet import (
     SOFT,
     ZOOM,
     Sheet,
+    alone,
     around_zero,
     fit_of,
     is_area,
@@ -36,7 +37,10 @@ _ACROSS = (121, 61)
 _CELLS = 16
 # Cells of the grid over the picture's width.
 _LINE_POINTS = 121
-_FLAT = 1e-9
+_FLAT, _SAME_SHADE = 1e-9, 0.01
+# px, and the share of a value, below which a map is taken to be of one value.
+_LABEL_EDGE, _LABEL_ROOM = 0.07, (0.15, 0.08)
+# Shares of the axes: a label nearer to the border, or to another, is left away.
 
 
 def surfaces(table: LensTable) -> Sheet:
@@ -52,21 +56,21 @@ def surfaces(table: LensTable) -> Sheet:
     sheet = Sheet(title, "contours of the surface through all levels; dots: the levels it rests on")
     zoom, focus = _mesh(surface)
     batch = surface.at_many(zoom.ravel(), focus.ravel())
-    first, second, third = sheet.axes(1, 3)
+    first, second, third = panels = sheet.axes(1, 3)
+    for axes in panels:  # before the contours: where their labels go depends on the limits
+        _levels(axes, fit)
     f_px = batch.f_px.reshape(zoom.shape)
     drawn = first.pcolormesh(zoom, focus, f_px, norm=LogNorm(), cmap="viridis", shading="gouraud", rasterized=True)
-    _contours(first, zoom, focus, batch.fov_x_deg.reshape(zoom.shape), "%.3g°", even_log=True)
-    sheet.bar(drawn, first, "focal length, px (log)", FuncFormatter(lambda value, _: f"{value:g}"))
+    contours(first, zoom, focus, batch.fov_x_deg.reshape(zoom.shape), "%.3g°", even_log=True)
+    sheet.bar(drawn, first, "focal length, px (log)", LogLocator(10, (1, 1.5, 2, 3, 5, 7)))
     first.set_title("Field of view (lines), focal length")
     for axes, values, name in ((second, batch.k1_hw, K1), (third, batch.k2_hw, K2)):
         shaped = values.reshape(zoom.shape)
         cmap, norm = around_zero(shaped)
         drawn = axes.pcolormesh(zoom, focus, shaped, norm=norm, cmap=cmap, shading="gouraud", rasterized=True)
-        _contours(axes, zoom, focus, shaped, "%.3g")
+        contours(axes, zoom, focus, shaped, "%.3g")
         sheet.bar(drawn, axes, name)
         axes.set_title(f"Distortion {name[:2]}")
-    for axes in (first, second, third):
-        _levels(axes, fit)
     return sheet
 
 
@@ -80,12 +84,12 @@ def grid(table: LensTable, zoom: float | None, focus: float | None) -> Sheet:
     moved = np.linalg.norm(pixels - straight.project(rays), axis=-1)
     most = float(np.nanmax(moved))
     remark = (
-        f"{place(*at)}: FoV {lens.fov_x_deg:.3f}°, k1 {lens.k1_hw:+.4f}, k2 {lens.k2_hw:+.4f} (radius 1 at half width); "
+        f"{place(*at)}: FoV {lens.fov_x_deg:.3f}°, k1 {lens.k1_hw:+.4f}, k2 {lens.k2_hw:+.4f} (half width = 1); "
         f"distortion moves a pixel by at most {most:.2f} px"
     )
     sheet = Sheet(f"Distortion: {named(table)}", remark, 7.4)
     (axes,) = sheet.axes(1, 1)
-    _picture(axes, lens.image_size)
+    picture(axes, lens.image_size)
     if most > _FLAT:
         drawn = axes.pcolormesh(
             pixels[..., 0], pixels[..., 1], moved, cmap="Purples", norm=Normalize(0, most * 1.6), shading="gouraud",
@@ -117,7 +121,7 @@ def uncertainty(table: LensTable, zoom: float | None, focus: float | None) -> Sh
     sheet = Sheet(f"Overlay error to expect: {named(table)}", remark, 4.7)
     left, right = sheet.axes(1, 2, (1.15, 1))
     pixels = grid_pixels(table.image_size)
-    _picture(left, table.image_size)
+    picture(left, table.image_size)
     left.set_title(f"Over the picture, {place(*at)}")
     px_map(sheet, left, pixels, expected.map_px, "expected overlay error, px")
     _over_places(sheet, right, fit, at)
@@ -131,7 +135,7 @@ def px_map(sheet: Sheet, axes: Axes, pixels: FloatArray, values: FloatArray, lab
     drawn = axes.pcolormesh(
         pixels[..., 0], pixels[..., 1], values, norm=norm, cmap="viridis", shading="gouraud", rasterized=True
     )
-    _contours(axes, pixels[..., 0], pixels[..., 1], values, "%.3g")
+    contours(axes, pixels[..., 0], pixels[..., 1], values, "%.3g")
     sheet.bar(drawn, axes, label)
 
 
@@ -153,10 +157,10 @@ def _over_places(sheet: Sheet, axes: Axes, fit: SurfaceFit, at: tuple[float, flo
         zoom, focus = _mesh(surface)
         values = surface.at_many(zoom.ravel(), focus.ravel()).predicted_max_px.reshape(zoom.shape)
         norm = Normalize(0, float(values.max()) or 1.0)
-        drawn = axes.pcolormesh(zoom, focus, values, norm=norm, cmap="viridis", shading="gouraud", rasterized=True)
-        _contours(axes, zoom, focus, values, "%.3g")
-        sheet.bar(drawn, axes, "expected overlay error, px")
         _levels(axes, fit)
+        drawn = axes.pcolormesh(zoom, focus, values, norm=norm, cmap="viridis", shading="gouraud", rasterized=True)
+        contours(axes, zoom, focus, values, "%.3g")
+        sheet.bar(drawn, axes, "expected overlay error, px")
         axes.plot(*at, "D", markersize=8, markerfacecolor="none", markeredgecolor="white", markeredgewidth=2, zorder=7)
         axes.plot(*at, "D", markersize=9.5, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1, zorder=7)
         return
@@ -178,8 +182,8 @@ def _over_places(sheet: Sheet, axes: Axes, fit: SurfaceFit, at: tuple[float, flo
     axes.set_title(_one_axis(surface)[:1].upper() + _one_axis(surface)[1:].split(";")[0])
     axes.set_xlabel(FOCUS if over_focus else ZOOM)
     axes.set_ylabel("expected overlay error, px")
-    axes.set_ylim(bottom=0)
-    axes.margins(y=0.15)
+    axes.set_ylim(0, 1.15 * axes.dataLim.y1 or 1.0)
+    alone(axes, levels[:, 1 if over_focus else 0])
     axes.legend(loc="best")
 
 
@@ -193,10 +197,7 @@ def _one_axis(surface: LensSurface) -> str:
 
 
 def _place(surface: LensSurface, zoom: float | None, focus: float | None) -> tuple[float, float]:
-    return (
-        surface.zoom_range[0] if zoom is None else zoom,
-        surface.focus_range[0] if focus is None else focus,
-    )
+    return surface.zoom_range[0] if zoom is None else zoom, surface.focus_range[0] if focus is None else focus
 
 
 def _mesh(surface: LensSurface) -> tuple[FloatArray, FloatArray]:
@@ -206,27 +207,35 @@ def _mesh(surface: LensSurface) -> tuple[FloatArray, FloatArray]:
     return zoom, focus
 
 
-def _contours(
-    axes: Axes, x: FloatArray, y: FloatArray, values: FloatArray, label: str, even_log: bool = False
-) -> None:
+def contours(axes: Axes, x: FloatArray, y: FloatArray, values: FloatArray, label: str, even_log: bool = False) -> None:
     """Labelled contours; none where the values are all but the same."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    if high - low <= 1e-6 * max(abs(low), abs(high), _FLAT):
+    if high - low <= _SAME_SHADE * max(abs(low), abs(high), _FLAT):
         return
     if even_log and high > 1.5 * low > 0:
         levels = np.unique([float(f"{level:.2g}") for level in np.geomspace(low, high, 9)[1:-1]])
         lines = axes.contour(x, y, values, levels=levels, colors="white", linewidths=1.1)
     else:
         lines = axes.contour(x, y, values, levels=7, colors="white", linewidths=1.1)
+    to_share = axes.transData + axes.transAxes.inverted()
+    kept: list[FloatArray] = []
     for text in axes.clabel(lines, fmt=label, fontsize=9, colors=INK, inline=False):
+        at = np.asarray(to_share.transform(text.get_position()))
+        crowded = any(np.all(np.abs(at - other) < _LABEL_ROOM) for other in kept)
+        if crowded or np.min(at) < _LABEL_EDGE or np.max(at) > 1 - _LABEL_EDGE:
+            text.set_visible(False)
+            continue
+        kept.append(at)
         text.set_bbox({"boxstyle": "round,pad=0.18", "facecolor": "white", "edgecolor": "none", "alpha": 0.85})
-        text.set_rotation(0)
+        text.set(rotation=0, zorder=8)
 
 
 def _levels(axes: Axes, fit: SurfaceFit) -> None:
     """The levels on a map over zoom and focus, those left out crossed."""
     used = [(check.zoom, check.focus) for check in fit.checks if check.used]
-    axes.plot(*zip(*used, strict=True), "o", color=INK, markersize=4.5, markeredgecolor="white", clip_on=False, zorder=5)
+    axes.plot(
+        *zip(*used, strict=True), "o", color=INK, markersize=4.5, markeredgecolor="white", clip_on=False, zorder=5
+    )
     out = [(check.zoom, check.focus) for check in fit.checks if not check.used]
     if out:
         axes.plot(*zip(*out, strict=True), "X", color=FAILED, markersize=9, markeredgecolor="white", clip_on=False,
@@ -238,7 +247,7 @@ def _levels(axes: Axes, fit: SurfaceFit) -> None:
     axes.set_ylim(*fit.surface.focus_range)
 
 
-def _picture(axes: Axes, image_size: tuple[int, int]) -> None:
+def picture(axes: Axes, image_size: tuple[int, int]) -> None:
     """Axes of the picture: v down, pixels square, its border drawn."""
     width, height = image_size
     axes.set_xlim(-0.5, width - 0.5)

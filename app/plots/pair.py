@@ -8,8 +8,8 @@ from matplotlib.colors import Normalize
 
 from app.comparison import verdict
 from app.lens_at import between_levels, lens_at
-from app.plots.maps import _contours, _picture, px_map
-from app.plots.sheet import FAILED, FOCUS, INK, LINES, SOFT, ZOOM, Sheet, named, place
+from app.plots.maps import contours, picture, px_map
+from app.plots.sheet import FAILED, FOCUS, INK, LINES, SOFT, ZOOM, Sheet, alone, named, place
 from calibration.compare import grid_pixels
 from calibration.compare_tables import DifferenceMap, PlaceDifference, TableComparison, compare_tables
 from calibration.tables import LensTable
@@ -21,7 +21,7 @@ _ARROWS = 4
 def comparison(first: LensTable, second: LensTable) -> Sheet:
     """Raises :class:`calibration.errors.InvalidInput` where the two cannot be compared."""
     found = compare_tables(first, second, between_levels(first), between_levels(second))
-    sheet = Sheet(f"{named(first)}, against {named(second)}", verdict(found).split(". ")[0].rstrip(".") + ".", 4.7)
+    sheet = Sheet(f"{named(first)}, against {named(second)}", verdict(found), 4.7)
     left, right = sheet.axes(1, 2, (1, 1.15))
     _places(sheet, left, found)
     _worst(sheet, right, first, second, found)
@@ -49,8 +49,8 @@ def _places(sheet: Sheet, axes: Axes, found: TableComparison) -> None:
     )  # fmt: skip
     axes.set_xlabel(FOCUS if over_focus else ZOOM)
     axes.set_ylabel("distance of the same ray, px")
-    axes.margins(y=0.15)
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.15 * found.difference_px.max or 1.0)
+    alone(axes, np.array([one.focus if over_focus else one.zoom for one in told or [found.worst]]))
     axes.legend(loc="best")
 
 
@@ -59,12 +59,14 @@ def _map(sheet: Sheet, axes: Axes, grid: DifferenceMap, found: TableComparison) 
     values = np.array([np.nan if one.difference_px is None else one.difference_px.max for one in grid.places])
     values = values.reshape(shape)
     zoom, focus = np.meshgrid(grid.zooms, grid.focuses)
+    axes.set_xlim(grid.zooms[0], grid.zooms[-1])
+    axes.set_ylim(grid.focuses[0], grid.focuses[-1])
     most = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
     if np.isfinite(values).all():
         drawn = axes.pcolormesh(
             zoom, focus, values, norm=Normalize(0, most or 1.0), cmap="viridis", shading="gouraud", rasterized=True
         )
-        _contours(axes, zoom, focus, values, "%.3g")
+        contours(axes, zoom, focus, values, "%.3g")
     else:  # what is not told stays white
         drawn = axes.pcolormesh(
             zoom, focus, np.ma.masked_invalid(values), norm=Normalize(0, most or 1.0), cmap="viridis",
@@ -92,7 +94,7 @@ def _worst(sheet: Sheet, axes: Axes, first: LensTable, second: LensTable, found:
     lenses = [lens_at(table, *at) for table in (first, second)]
     pixels = grid_pixels(first.image_size)
     way = lenses[1].project(lenses[0].unproject(pixels)) - pixels
-    _picture(axes, first.image_size)
+    picture(axes, first.image_size)
     axes.set_title(f"Over the picture where it is worst, {place(*at)}")
     distance = np.linalg.norm(way, axis=-1)
     px_map(sheet, axes, pixels, distance, "distance of the same ray, px")
@@ -106,8 +108,9 @@ def _worst(sheet: Sheet, axes: Axes, first: LensTable, second: LensTable, found:
         axes.plot(
             *found.worst.worst_px, "*", color=FAILED, markersize=15, markeredgecolor="white", clip_on=False, zorder=6
         )
+    note = "★ the farthest apart; arrows: from this table's pixel to the other's, not to scale"
     axes.annotate(
-        "arrows: from this table's pixel to the other's, not to scale", (0, -0.2), xycoords="axes fraction",
+        note, (0, -0.2), xycoords="axes fraction",
         fontsize=8.5, color=SOFT,
     )  # fmt: skip
 

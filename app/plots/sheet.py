@@ -6,17 +6,20 @@ Never ``pyplot``: a :class:`matplotlib.figure.Figure` by itself keeps nothing al
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, cast
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import Formatter, FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, Locator, LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from app.lens_at import surface_fit
 from calibration.surface import LensSurface, SurfaceFit
@@ -35,7 +38,10 @@ FOV = "horizontal FoV, degrees"
 
 WIDTH_IN = 12.8
 _PNG_DPI = 150
-_HEAD_IN = 0.78
+_HEAD_IN, _LINE_IN = 0.78, 0.19
+_TITLE_SIGNS, _REMARK_SIGNS = 95, 150
+# What fits beside each other.
+_PLACE_DIGITS = 5
 _UNKNOWN = "\N{REPLACEMENT CHARACTER}"
 
 _SETTINGS: dict[str, Any] = {
@@ -62,6 +68,7 @@ _SETTINGS: dict[str, Any] = {
     "text.color": INK,
     "text.parse_math": False,  # a lens may be called anything
     "axes.formatter.use_mathtext": False,
+    "axes.formatter.useoffset": False,
     "xtick.color": SOFT,
     "xtick.labelsize": 9,
     "ytick.color": SOFT,
@@ -74,7 +81,7 @@ def styled() -> Iterator[None]:
     """matplotlib with its own defaults and the settings of these pictures, whatever a user's file says."""
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams.update(_SETTINGS)
+        mpl.rcParams.update(cast(Any, _SETTINGS))
         yield
 
 
@@ -83,36 +90,56 @@ class Sheet:
 
     def __init__(self, title: str, remark: str, height_in: float = 4.9) -> None:
         self.title = title
+        told = textwrap.wrap(writable(remark), _REMARK_SIGNS) or [""]
+        extra = _LINE_IN * (len(told) - 1)
+        height_in += extra
         self.figure = Figure(figsize=(WIDTH_IN, height_in), facecolor="white", layout="constrained")
-        head = _HEAD_IN / height_in
+        head = (_HEAD_IN + extra) / height_in
         engine = cast(ConstrainedLayoutEngine, self.figure.get_layout_engine())
         engine.set(rect=(0.004, 0.01, 0.992, 1 - head - 0.01), w_pad=0.1, h_pad=0.1, wspace=0.03, hspace=0.04)
         top = 1 - 0.14 / height_in
-        self.figure.text(0.012, top, writable(title), fontsize=14, fontweight="bold", va="top")
-        self.figure.text(0.012, top - 0.32 / height_in, writable(remark), fontsize=10, color=SOFT, va="top")
+        self.figure.text(0.012, top, writable(_cut(title)), fontsize=14, fontweight="bold", va="top")
+        self.figure.text(0.012, top - 0.32 / height_in, "\n".join(told), fontsize=10, color=SOFT, va="top")
 
     def axes(self, rows: int, columns: int, widths: Sequence[float] | None = None) -> list[Axes]:
         """The axes, row by row."""
         grid = self.figure.subplots(rows, columns, squeeze=False, gridspec_kw={"width_ratios": widths})
         return [cast(Axes, axes) for axes in grid.ravel()]
 
-    def bar(self, drawn: Any, axes: Axes, label: str, levels: Formatter | None = None) -> None:
+    def bar(self, drawn: Any, axes: Axes, label: str, ticks: Locator | None = None) -> None:
         """A colour bar beside ``axes``."""
-        bar = self.figure.colorbar(drawn, ax=axes, pad=0.02, fraction=0.05, aspect=28, format=levels)
+        bar = self.figure.colorbar(drawn, ax=axes, pad=0.02, fraction=0.05, aspect=28, ticks=ticks)
+        if ticks is not None:
+            bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        bar.minorticks_off()
         bar.set_label(label, fontsize=9)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
         bar.ax.tick_params(length=2)
         bar.ax.grid(False)
-        bar.minorticks_off()
 
     def saved(self, media: str) -> bytes:
         """The file: no date and no version in it, so that the same table gives the same bytes."""
+        self._settle()
         out = io.BytesIO()
         if media == "svg":
             self.figure.savefig(out, format="svg", metadata={"Date": None, "Creator": "Lensmatch", "Title": self.title})
         else:
             self.figure.savefig(out, format="png", dpi=_PNG_DPI, metadata={"Software": "Lensmatch"})
         return out.getvalue()
+
+    def _settle(self) -> None:
+        """Place the axes once, to rounded places: the layout's solver leaves other last digits each time."""
+        layout = self.figure.get_layout_engine()
+        if layout is not None:
+            layout.execute(self.figure)
+        self.figure.set_layout_engine("none")
+        for axes in self.figure.axes:
+            corners = np.round(axes.get_position(original=True).get_points(), _PLACE_DIGITS)
+            axes.set_position(Bbox(corners), which="original")
+
+
+def _cut(title: str) -> str:
+    return title if len(title) <= _TITLE_SIGNS else title[: _TITLE_SIGNS - 1] + "…"
 
 
 def fit_of(table: LensTable) -> SurfaceFit:
@@ -167,3 +194,9 @@ def log_ticks(axes: Axes, values: FloatArray) -> None:
 def is_area(surface: LensSurface) -> bool:
     """Whether the levels span both zoom and focus."""
     return surface.zoom_range[1] > surface.zoom_range[0] and surface.focus_range[1] > surface.focus_range[0]
+
+
+def alone(axes: Axes, along: FloatArray) -> None:
+    """The encoder's whole range where all points stand at one place, instead of a hair's breadth about it."""
+    if float(np.ptp(along)) == 0.0:
+        axes.set_xlim(min(-0.03, float(along[0]) - 0.1), max(1.03, float(along[0]) + 0.1))
