@@ -1,4 +1,4 @@
-"""Between the levels: the table's surface as pictures, how far it is off at levels it has not seen, what it leaves out."""
+"""Between the levels: the surface as pictures, how far it is off at levels it has not seen, what it leaves out."""
 
 from __future__ import annotations
 
