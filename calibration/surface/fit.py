@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from calibration.errors import InvalidInput
 from calibration.surface.evaluate import LensSurface
@@ -36,6 +36,8 @@ _MOST_LEFT_OUT = 0.25
 _SUSPECTS = 3
 _ARRIVED = 0.05
 # Chance above which a level is taken to fit at another zoom.
+_ELSEWHERE = 0.01
+# Steps of zoom below which that is no other place.
 _SAME_PLACE = (0.002, 0.02)
 # Encoder steps under which two levels stand at one place and must agree.
 _CONTRADICTION_PX, _CONTRADICTION_SIGMA = 1.0, 6.0
@@ -111,7 +113,7 @@ def find_outliers(data: LevelData, prior: PriorMean | None) -> dict[int, tuple[L
             # The smoothness is learned again without it: with it, a wrong level makes every lens look rough.
             others = LensModel.fit(data.only([i for i in kept if i != level]), prior)
             found = against(others, data, level)
-            chance = chance_of(found, len(kept) - 1)
+            chance = chance_of(found, others.spare)
             if worst is None or chance < worst[0]:
                 worst = (chance, level, others, found)
         if worst is None or worst[0] >= REJECTED_CHANCE / len(data) or worst[3].error_px < HARMLESS_PX:
@@ -128,11 +130,11 @@ def against(model: LensModel, data: LevelData, level: int) -> LevelMisfit:
     return misfit(data.values[level] - model.mean(*place)[0], covariance, data.values[level], data.image_size)
 
 
-def chance_of(found: LevelMisfit, levels: int) -> float:
-    """Chance of a larger misfit against a surface whose smoothness ``levels`` levels have told."""
+def chance_of(found: LevelMisfit, spare: int) -> float:
+    """Chance of a larger misfit against a surface whose smoothness was learned from ``spare`` degrees of freedom."""
     size = len(QUANTITIES)
     chi2 = float(found.residual @ np.linalg.solve(found.covariance, found.residual))
-    return float(stats.f.sf(chi2 / size, size, max(levels - 3, 1)))
+    return float(stats.f.sf(chi2 / size, size, max(spare, 1)))
 
 
 def _require_consistent(data: LevelData) -> None:
@@ -178,17 +180,24 @@ def _explain(model: LensModel, data: LevelData, level: int, found: LevelMisfit) 
     """What is wrong with a level, for the operator."""
     zoom, focus = float(data.zoom[level]), float(data.focus[level])
     told = f"{found.error_px:.1f} px from where its neighbours put it (expected {found.expected_px:.1f} px)"
+
+    def misfit_at(zooms: FloatArray) -> FloatArray:
+        places = (zooms, np.full(len(zooms), focus))
+        covariances = model.covariance(*places) + data.covariance[level]
+        rest = data.values[level] - model.mean(*places)
+        return np.asarray(np.einsum("ni,ni->n", rest, np.linalg.solve(covariances, rest[..., None])[..., 0]))
+
     along = np.linspace(float(data.zoom.min()), float(data.zoom.max()), 201)
-    places = (along, np.full(len(along), focus))
-    means, covariances = model.mean(*places), model.covariance(*places) + data.covariance[level]
-    rest = data.values[level] - means
-    chi2 = np.einsum("ni,ni->n", rest, np.linalg.solve(covariances, rest[..., None])[..., 0])
-    best = int(np.argmin(chi2))
-    fits = stats.f.sf(chi2[best] / len(QUANTITIES), len(QUANTITIES), max(len(data) - 4, 1)) > _ARRIVED
-    if fits and abs(along[best] - zoom) > 0.01:
-        return (
-            f"{told}: its numbers are those of zoom {along[best]:.3f}; the lens had not arrived, or its encoder slipped"
-        )
+    near = along[max(int(np.argmin(misfit_at(along))) - 1, 0)]
+    best = optimize.minimize_scalar(
+        lambda place: float(misfit_at(np.array([place]))[0]),
+        bounds=(near, min(near + 2 * (along[1] - along[0]), float(along[-1]))),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    size = len(QUANTITIES)
+    if stats.f.sf(best.fun / size, size, max(model.spare, 1)) > _ARRIVED and abs(best.x - zoom) > _ELSEWHERE:
+        return f"{told}: it fits at zoom {best.x:.3f}; the lens had not arrived, or its encoder slipped"
     spread = np.sqrt(np.diag(found.covariance))
     quantity = int(np.argmax(np.abs(found.residual) / spread))
     value, sigmas = float(found.residual[quantity]), abs(float(found.residual[quantity])) / float(spread[quantity])
@@ -222,7 +231,7 @@ def _checks(
             checks.append(LevelCheck(level.zoom, level.focus, True, reason="too few levels to compare with"))
         else:
             found = model.misfits[in_model[place]]
-            chance = chance_of(found, len(kept) - 1)
+            chance = chance_of(found, model.spare)
             checks.append(LevelCheck(level.zoom, level.focus, True, found.error_px, found.expected_px, chance))
     return tuple(checks)
 

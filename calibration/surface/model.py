@@ -130,10 +130,15 @@ class LensModel:
             _nodal(data),
             (),
         )
-        spare = len(data) - max(len(s.trend.at(*_ORIGIN)[0]) for s in (*optics.smooth, *shift.smooth))
-        if spare < 2:
+        if model.spare < 2:
             return model  # without a level its trend could not be drawn, so none can be compared with the others
         return replace(model, misfits=tuple(model._misfit(i) for i in range(len(data))))
+
+    @property
+    def spare(self) -> int:
+        """How many levels there are beyond those that the trends take: what the smoothness is learned from."""
+        smooth = (*self.optics.smooth, *self.shift.smooth)
+        return len(self.data) - max(len(s.trend.at(*_ORIGIN)[0]) for s in smooth)
 
     def mean(self, zoom: FloatArray, focus: FloatArray) -> FloatArray:
         """The quantities (N, 5) at places (N,)."""

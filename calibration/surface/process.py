@@ -126,13 +126,12 @@ def choose_smoothness(
         zoom, focus, values, noise = zoom[some], focus[some], values[some], noise[some]
     zoom_distance = np.abs(zoom[:, None] - zoom[None, :])
     focus_distance = np.abs(focus[:, None] - focus[None, :])
-    found: list[tuple[float, float, Shape]] = []
     terms = trend.at(zoom, focus)
-    for shape in _shapes(len(set(focus.tolist())) > 1):
-        correlation = shape.between(zoom_distance, focus_distance)
-        variance, likelihood = _profile(correlation, terms, values, noise, expected)
-        prior = -0.5 * ((math.log(shape.length) - _LENGTH_PRIOR[0]) / _LENGTH_PRIOR[1]) ** 2
-        found.append((likelihood + prior, variance, shape))
+    shapes = _shapes(len(set(focus.tolist())) > 1)
+    correlations = np.stack([shape.between(zoom_distance, focus_distance) for shape in shapes])
+    variances, likelihoods = _profile(correlations, terms, values, noise, expected)
+    priors = [-0.5 * ((math.log(shape.length) - _LENGTH_PRIOR[0]) / _LENGTH_PRIOR[1]) ** 2 for shape in shapes]
+    found = [*zip((likelihoods + np.array(priors)).tolist(), variances.tolist(), shapes, strict=True)]
     best = max(likelihood for likelihood, _, _ in found)
     weights = np.array([math.exp(likelihood - best) for likelihood, _, _ in found])
     total = float(weights.sum())
@@ -149,24 +148,26 @@ def _shapes(several_focuses: bool) -> list[Shape]:
 
 
 def _profile(
-    correlation: FloatArray, terms: FloatArray, values: FloatArray, noise: FloatArray, expected: float
-) -> tuple[float, float]:
-    """(s^2, restricted log likelihood) for a correlation (n, n); the noise's share of s^2 is found on the way."""
+    correlations: FloatArray, terms: FloatArray, values: FloatArray, noise: FloatArray, expected: float
+) -> tuple[FloatArray, FloatArray]:
+    """(s^2, restricted log likelihood) (S,) for correlations (S, n, n); the noise's share of s^2 comes out as well."""
     count = len(values)
     degrees = count - terms.shape[1] + 1
-    variance = expected**2
-    likelihood = -math.inf
+    variance = np.full(len(correlations), expected**2)
+    likelihood = np.zeros(len(correlations))
+    diagonal = np.arange(count)
     for _ in range(2):
-        matrix = correlation + np.diag(noise / variance + _NUGGET)
-        factor = cho_factor(matrix, lower=True)
-        whitened_terms = cho_solve(factor, terms)
-        gram = terms.T @ whitened_terms
-        beta = np.linalg.solve(gram, whitened_terms.T @ values)
-        rest = values - terms @ beta
-        squares = float(rest @ cho_solve(factor, rest)) + expected**2
-        variance = max(squares / degrees, (1e-6 * expected) ** 2)
-        determinant = 2 * float(np.sum(np.log(np.diag(factor[0])))) + float(np.linalg.slogdet(gram)[1])
-        likelihood = -0.5 * (degrees * math.log(variance) + determinant)
+        matrix = correlations.copy()
+        matrix[:, diagonal, diagonal] += noise / variance[:, None] + _NUGGET
+        inverse = np.linalg.inv(matrix)
+        whitened = inverse @ terms
+        gram = terms.T @ whitened
+        beta = np.linalg.solve(gram, (values @ whitened)[..., None])[..., 0]
+        rest = values - beta @ terms.T
+        squares = np.maximum(np.einsum("sn,snm,sm->s", rest, inverse, rest), 0.0) + expected**2
+        variance = np.maximum(squares / degrees, (1e-6 * expected) ** 2)
+        determinant = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(gram)[1]
+        likelihood = -0.5 * (degrees * np.log(variance) + determinant)
     return variance, likelihood
 
 

@@ -59,12 +59,13 @@ def test_every_kind_of_every_table(name: str, kind: PlotKind) -> None:
     }
     for label in labels[kind]:
         assert label in told
-    assert drawn(TABLES[name], kind) == svg
     assert b"<dc:date>" not in svg
 
 
 @pytest.mark.parametrize("kind", PlotKind)
-def test_png(kind: PlotKind) -> None:
+def test_the_same_table_gives_the_same_bytes(kind: PlotKind) -> None:
+    svg = drawn(TABLES["two"], kind)
+    assert drawn(TABLES["two"], kind) == svg
     png = drawn(TABLES["two"], kind, PlotMedia.PNG)
     assert png.startswith(b"\x89PNG\r\n\x1a\n")
     width, height = (int.from_bytes(png[start : start + 4], "big") for start in (16, 20))
@@ -141,11 +142,11 @@ def test_two_equal_tables_can_be_compared() -> None:
 
 @pytest.mark.parametrize("place", [(0.1, 0.2), (0.5, 0.5), (0.9, 0.8)])
 def test_the_map_over_the_picture_agrees_with_the_surface(place: tuple[float, float]) -> None:
-    """The surface predicts at coarser places, in other coordinates, and reads them off its grid."""
+    """The surface predicts at coarser places, in other coordinates."""
     surface = surface_fit(TABLES["area"]).surface
-    found = surface.at(*place)
-    expected = predicted_overlay(found.lens, covariance_of(surface, *place))
-    assert expected.max_px == pytest.approx(found.predicted_px.max, rel=0.05)
+    expected = predicted_overlay(surface.at(*place).lens, covariance_of(surface, *place))
+    _, largest = surface.model.predicted_px(*(np.array([value]) for value in place))
+    assert expected.max_px == pytest.approx(float(largest[0]), rel=0.03)
     assert np.isfinite(expected.map_px).all()
 
 
