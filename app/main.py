@@ -12,7 +12,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.types import Lifespan
 
-from app.api import errors, jobs, lenses, publishing, service, sockets, tables
+from app.api import errors, jobs, lenses, publishing, service, sockets, table_pictures, tables
 from app.api.context import PREFIX, AppContext
 from app.api.guard import Guard
 from app.api.tail import EventTail
@@ -39,6 +39,7 @@ def create_app(context: AppContext, running: Sequence[AbstractAsyncContextManage
     app = _routes(lifespan)
     app.state.context = context
     app.state.tail = EventTail(context.repository)
+    app.state.drawing = asyncio.Lock()
     errors.install(app, context.settings.retry_after_s)
     app.add_middleware(Guard, settings=context.settings)
     return app
@@ -77,7 +78,7 @@ def _routes(lifespan: Lifespan[FastAPI] | None) -> FastAPI:
         lifespan=lifespan,
         responses=errors.responses("internal", "storage-busy"),
     )
-    for part in (jobs, lenses, tables, publishing, service, sockets):
+    for part in (jobs, lenses, tables, table_pictures, publishing, service, sockets):
         app.include_router(part.router, prefix=PREFIX)
     return app
 

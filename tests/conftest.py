@@ -23,6 +23,8 @@ from hypothesis import Phase, settings
 REPOSITORY = Path(__file__).resolve().parents[1]
 LEAVE_BOUND_S = 1.0
 """How long a thread or a child process may take to end after its test: they end on their own, not at once."""
+FONTS = ".ttf"
+"""Files that matplotlib keeps open for the whole run, as it should; an environment may stand inside the checkout."""
 HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 """Children that the standard library starts once and keeps for the whole run."""
 
@@ -92,7 +94,8 @@ def _open_files() -> dict[int, str]:
 def _new_files(before: dict[int, str]) -> list[str]:
     """Regular files and sockets that are open now and were not before, in words."""
     ours = (str(REPOSITORY), os.path.realpath(os.environ.get("TMPDIR", "/tmp")), "socket:")
-    return [name for number, name in _open_files().items() if before.get(number) != name and name.startswith(ours)]
+    new = [name for number, name in _open_files().items() if before.get(number) != name and name.startswith(ours)]
+    return [name for name in new if not name.endswith(FONTS)]
 
 
 def _after_settling(left: Callable[[], list[str]]) -> list[str]:

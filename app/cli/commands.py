@@ -19,6 +19,7 @@ from app.cli.demo import demo
 from app.cli.detect import detect
 from app.cli.doctor import doctor
 from app.cli.exports import export_table, import_table
+from app.cli.plot import plot
 from app.cli.publish import publish
 from app.cli.run import run
 from app.cli.serve import serve
@@ -112,6 +113,14 @@ cli.command(
     rich_help_panel=_TABLES,
     epilog=_examples("lensmatch compare before.json after.json", "lensmatch compare before.json after.json --json"),
 )(compare)
+cli.command(
+    rich_help_panel=_TABLES,
+    epilog=_examples(
+        "lensmatch plot table.json --out curves.svg",
+        "lensmatch plot table.json --kind grid --zoom 0 --focus 0 --out grid.png",
+        "lensmatch plot before.json --kind comparison --with after.json --out apart.svg",
+    ),
+)(plot)
 cli.command(
     rich_help_panel=_TABLES,
     epilog=_examples("lensmatch tables", "lensmatch tables --database lensmatch-demo/lensmatch.db"),

@@ -73,6 +73,7 @@ _DOCUMENTS = {
     '[{"zoom":, "focus":, "values": [{"name":, "asked":, "got":, "same":}], "compared":, "renders":, "render_px":, '
     '"limit_px":, "reason":, "ok":}], "job":}`, `null` what is not told; a publication that failed has `"error":` '
     "besides",
+    "`plot`": '`{"out":, "kind":}`',
     "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "

@@ -10,6 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from app.report.between import between_view
 from app.report.figures import charts
 from app.report.levels import Notes, evidence_row, lens_rows, level_view
 from app.report.model import LevelReport, RunReport
@@ -38,6 +39,7 @@ def render_report(report: RunReport) -> str:
         tone=_tone(report),
         facts=[*_table_facts(report.table), *report.facts],
         charts=charts(report),
+        between=between_view(report.table),
         levels=levels,
         lens_rows=rows,
         evidence=evidence,

@@ -337,3 +337,21 @@ def test_ticks_are_round_and_inside() -> None:
     assert ticks(-0.09, 0.04, 6) == pytest.approx([-0.075, -0.05, -0.025, 0.0, 0.025])
     assert log_ticks(7.0, 64.0) == pytest.approx([8, 10, 15, 20, 30, 40, 50, 60])
     assert all(0.9 <= tick <= 1.1 for tick in log_ticks(0.9, 1.1))
+
+
+def test_the_lens_between_its_levels_is_drawn_and_judged() -> None:
+    page = render_report(report([level(zoom, truth=False) for zoom in (0.0, 0.3, 0.7, 1.0)]))
+    assert "Between the levels" in page
+    assert page.count("data:image/svg+xml;base64,") == 1
+    assert "At a level held out of the fit" in page
+    both = [level(zoom, truth=False, focus=focus) for zoom in (0.0, 0.5, 1.0) for focus in (0.0, 1.0)]
+    assert render_report(report(both)).count("data:image/svg+xml;base64,") == 2
+    few = render_report(report([level(0.0), level(1.0)]))
+    assert "Between the levels" not in few
+
+
+def test_levels_that_make_no_surface_are_said() -> None:
+    backwards = [replace(level(zoom), result=replace(level(1 - zoom).result, zoom=zoom)) for zoom in (0.0, 0.5, 1.0)]
+    page = render_report(report(backwards))
+    assert "the zoom encoder runs backwards" in page
+    assert "data:image/svg+xml" not in page
