@@ -61,6 +61,7 @@ _MOST_STEPS, _MOST_HALVINGS, _ARRIVED = 30, 12, 1e-6
 _LEAST_TOLD = 1.0
 # Information under which an offset up to the largest remount would not be seen at all.
 _INSIDE = 0.99
+_HOPELESS = 4.0
 _SHIFT, _ZOOM, _FOCUS = (0, 1), (2,), (3,)
 _EXPLANATIONS = ((_SHIFT,), (_ZOOM,), (_FOCUS,), (_SHIFT, _ZOOM), (_SHIFT, _FOCUS), (_ZOOM, _FOCUS))
 _LAST = (_SHIFT, _ZOOM, _FOCUS)
@@ -137,6 +138,7 @@ class _Explanation:
     parts: tuple[tuple[int, ...], ...]
     values: FloatArray
     covariance: FloatArray
+    chi2: float
     chance: float
     left_px: FloatArray
     certain: bool
@@ -165,8 +167,12 @@ def recheck(surface: LensSurface, levels: LevelData, *, goal_px: float = GOAL_PX
         within = "" if worst <= goal_px else f", which their noise ({float(noise.max()):.2f} px, one sigma) allows"
         reason = f"the stored lens is at most {worst:.2f} px off at {len(levels)} levels{within}"
         return Recheck(Verdict.HOLDS, goal_px, worst, None, agreements, None, reason)
-    for parts in _candidates(surface):
-        found = check.explain(parts)
+    candidates = _candidates(surface)
+    # The fewer the parameters, the larger the misfit: where that of all of them is hopeless, none needs to be tried.
+    most = check.explain(candidates[-1])
+    hopeless = most.chi2 > _HOPELESS * stats.chi2.isf(MISFIT_CHANCE, len(QUANTITIES) * len(levels))
+    for parts in () if hopeless else candidates:
+        found = most if parts == candidates[-1] else check.explain(parts)
         if found.certain and found.inside and found.chance >= MISFIT_CHANCE and np.all(found.left_px <= goal_px):
             left = tuple(replace(a, left_px=float(px)) for a, px in zip(agreements, found.left_px, strict=True))
             remount, left_px = _remount(found), float(found.left_px.max())
@@ -344,6 +350,7 @@ class _Check:
             parts,
             values,
             covariance,
+            cost,
             float(stats.chi2.sf(cost, freedom)),
             self.overlay_px(values),
             known and all(_is_certain(values, covariance, part) for part in parts),

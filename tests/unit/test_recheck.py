@@ -57,9 +57,11 @@ def noise_covariance(lens: Lens) -> FloatArray:
     return np.asarray(np.linalg.inv(gram) * NOISE_PX**2)
 
 
-def measured(lens_at: TableOf, places: list[tuple[float, float]], rng: np.random.Generator) -> LevelData:
+def measured(
+    lens_at: TableOf, places: list[tuple[float, float]], rng: np.random.Generator, noise: float = 1.0
+) -> LevelData:
     lenses = [lens_at(zoom, focus) for zoom, focus in places]
-    covariances = np.array([noise_covariance(lens) for lens in lenses])
+    covariances = np.array([noise_covariance(lens) * noise**2 for lens in lenses])
     rows = [rng.multivariate_normal(values_of(v), c) for v, c in zip(lenses, covariances, strict=True)]
     untold = np.full(len(places), np.nan)
     zoom, focus = np.array(places).T
@@ -110,17 +112,18 @@ def test_an_unchanged_lens_holds(surface: LensSurface) -> None:
 def test_noise_beyond_the_goal_is_no_change(surface: LensSurface) -> None:
     places = list(check_places(surface))
     held = 0
-    for seed in range(SEEDS):
-        levels = measured(true_lens, places, np.random.default_rng(seed))
-        mean = surface.model.mean(levels.zoom, levels.focus)
-        noisy = replace(levels, values=mean + (levels.values - mean) * 40, covariance=levels.covariance * 1600)
-        held += recheck(surface, noisy).verdict is Verdict.HOLDS
-    assert held > 0.95 * SEEDS
+    for seed in range(40):
+        levels = measured(true_lens, places, np.random.default_rng(seed), noise=20.0)
+        found = recheck(surface, levels)
+        assert found.verdict is not Verdict.CORRECTED
+        assert found.error_px > 1.0
+        held += found.verdict is Verdict.HOLDS
+    assert held > 36
 
 
 def corrections(found: list[Recheck]) -> list[Remount]:
     remounts = [one.remount for one in found if one.verdict is Verdict.CORRECTED and one.remount is not None]
-    assert len(remounts) >= 0.99 * SEEDS
+    assert len(remounts) >= 0.99 * len(found)
     return remounts
 
 
@@ -147,7 +150,7 @@ def test_a_slipped_zoom_encoder_is_corrected_to_within_noise(surface: LensSurfac
 
 
 def test_both_are_found_together_and_no_more_than_both(surface: LensSurface) -> None:
-    for one in corrections(verdicts(surface, remounted((4.0, 0.0), zoom=-0.01))):
+    for one in corrections(verdicts(surface, remounted((4.0, 0.0), zoom=-0.01), seeds=60)):
         assert one.focus_offset is None
         assert one.center_shift_px == pytest.approx((4.0, 0.0), abs=0.4)
         assert one.zoom_offset == pytest.approx(-0.01, abs=5e-4)
@@ -155,7 +158,7 @@ def test_both_are_found_together_and_no_more_than_both(surface: LensSurface) -> 
 
 def test_a_slipped_focus_encoder_is_told_where_focuses_tell_it(surface: LensSurface) -> None:
     places = [(0.03, 0.5), (0.5, 0.2), (0.5, 0.8), (0.97, 0.5)]
-    for one in corrections(verdicts(surface, remounted(focus=0.15), places)):
+    for one in corrections(verdicts(surface, remounted(focus=0.15), places, seeds=40)):
         assert one.focus_offset == pytest.approx(0.15, abs=0.03)
         assert one.zoom_offset is None
 
@@ -176,7 +179,7 @@ def test_a_slipped_focus_encoder_is_told_where_focuses_tell_it(surface: LensSurf
 )
 def test_what_no_remount_explains_is_never_corrected(surface: LensSurface, lens_at: TableOf) -> None:
     found = verdicts(surface, lens_at)
-    assert count(found, Verdict.CHANGED) == SEEDS
+    assert count(found, Verdict.CHANGED) == len(found)
     assert all(one.remount is None and "calibrate the lens again" in one.reason for one in found)
 
 
