@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from calibration.camera import target_rotation
 from calibration.errors import CalibrationError
 from calibration.solve.mistakes import Priors
+from calibration.surface.plan import PlanOptions
 from calibration.types import CameraPose, Role, Target, TargetKind, TargetPose
 
 _NEAREST_M = 0.01
@@ -225,6 +226,36 @@ def check_room(targets: Mapping[str, TargetModel], pivot_m: tuple[float, float, 
         _check_faces(name, target.pose, pivot_m)
 
 
+class PlanModel(Strict):
+    """Levels chosen where the overlay error between them is expected to be worst, until it is small enough."""
+
+    accuracy_px: Positive | None = Field(
+        default=1.0, description="largest overlay error wanted between levels; null: as good as the levels allow"
+    )
+    max_levels: Annotated[int, Field(ge=2, le=200)] = 13
+    max_minutes: Positive | None = Field(default=None, description="of measuring; null: no limit")
+    zoom_range: tuple[Unit, Unit] = (0.0, 1.0)
+    focus_range: tuple[Unit, Unit] = Field(default=(0.5, 0.5), description="lowest and highest; equal: one focus")
+
+    def to_options(self) -> PlanOptions:
+        """For the planner. Raises :class:`calibration.errors.InvalidInput`."""
+        return PlanOptions(
+            self.accuracy_px,
+            self.max_levels,
+            None if self.max_minutes is None else 60 * self.max_minutes,
+            self.zoom_range,
+            self.focus_range,
+        )
+
+    @model_validator(mode="after")
+    def _can_be_planned(self) -> PlanModel:
+        try:
+            self.to_options()
+        except CalibrationError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+
 class JobRequest(Strict):
     """A calibration job for an engine: which lens, which levels, what stands in the room."""
 
@@ -237,7 +268,12 @@ class JobRequest(Strict):
     image_size: tuple[Side, Side] = (1920, 1080)
     sensor_mm: tuple[Positive, Positive] | None = None
     pixel_aspect: Positive = 1.0
-    levels: list[LevelModel] = Field(min_length=1, max_length=1000)
+    levels: list[LevelModel] = Field(
+        default_factory=list, max_length=1000, description="a fixed grid of levels; none: plan chooses them"
+    )
+    plan: PlanModel | None = Field(
+        default=None, description="chooses the levels as it goes, instead of levels; null: the levels are listed"
+    )
     targets: dict[Name, TargetModel] = Field(min_length=1, description="surveyed targets: each needs its pose")
     pivot_m: tuple[Finite, Finite, Finite] = Field(description="where the camera's pivot stands")
     pivot_sigma_m: NotNegative = 0.0
@@ -259,6 +295,8 @@ class JobRequest(Strict):
     @model_validator(mode="after")
     def _can_be_measured(self) -> JobRequest:
         check_room(self.targets, self.pivot_m)
+        if bool(self.levels) == (self.plan is not None):
+            raise ValueError("give either levels or plan: one of them says what is measured")
         seen: set[tuple[float, float]] = set()
         for index, level in enumerate(self.levels):
             if (level.zoom, level.focus) in seen:

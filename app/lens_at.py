@@ -14,6 +14,9 @@ from calibration.tables import EVIDENCE_QUANTITIES, LensTable, LevelResult, Leve
 SAME_PLACE = 1e-6
 """Encoder values closer than this are one place: a head's protocol rounds them, a lens stands no more exactly."""
 
+SURFACE_KIND = "Gaussian process over zoom and focus"
+"""How a table's ``interpolation.kind`` names the surface."""
+
 _KEPT_FITS = 8
 # A client that follows a zoom asks for the same table again and again; a surface takes about 4 MB.
 

@@ -12,6 +12,7 @@ import os
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 
 from benchmarks.rows import Column, Progress, Row, readable
 
@@ -26,9 +27,12 @@ class Benchmark:
     title: str
     module: str
 
-    def run(self, *, quick: bool, progress: Progress | None = None) -> list[Row]:
-        """Run it; ``quick``: a small share of its cases."""
-        rows: list[Row] = importlib.import_module(self.module).run(quick=quick, progress=progress)
+    takes_lenses: bool = False
+
+    def run(self, *, quick: bool, progress: Progress | None = None, lenses: Path | None = None) -> list[Row]:
+        """Run it; ``quick``: a small share of its cases; ``lenses``: a file of lenses, where it takes one."""
+        more = {"lenses": lenses} if self.takes_lenses else {}
+        rows: list[Row] = importlib.import_module(self.module).run(quick=quick, progress=progress, **more)
         return rows
 
     def columns(self, rows: list[Row]) -> list[Column]:
@@ -66,6 +70,12 @@ BENCHMARKS = {
             "coverage", "whether errors lie within their sigmas, over random lenses and pictures", "benchmarks.coverage"
         ),
         Benchmark("loop", "how free the event loop stays while a job runs", "benchmarks.loop"),
+        Benchmark(
+            "lens",
+            "levels that a zoom lens needs, a wrong level among good ones, reading the lens anywhere",
+            "benchmarks.lens",
+            takes_lenses=True,
+        ),
         Benchmark("level", "one level's fit, beside OpenCV, mrcal and the study's method", "benchmarks.level"),
         Benchmark(
             "payload", "which picture file the capture card should send, and what decoding costs", "benchmarks.payload"

@@ -12,6 +12,7 @@ import typer
 
 from app.cli.console import check_out, print_json, progress_bar, reported_errors, say, write_file, wrong_usage
 from app.cli.tables import plain_table, print_table
+from app.documents import DocumentError
 from app.report.bench import BenchSection, bench_page
 from benchmarks.registry import BENCHMARKS, Benchmark, machine
 from benchmarks.rows import Row
@@ -28,6 +29,10 @@ def bench(
         Path | None,
         typer.Option("--report", metavar="PATH", dir_okay=False, help="write tables and plots as one HTML page"),
     ] = None,
+    lenses: Annotated[
+        Path | None,
+        typer.Option("--lenses", metavar="FILE", dir_okay=False, help="for lens: real lenses to judge by, as JSON"),
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="a small share of the cases, to see that it runs")] = False,
 ) -> None:
     """Run the benchmarks and print their figures beside those of the study's method and of public tools."""
@@ -36,13 +41,15 @@ def bench(
             if name not in BENCHMARKS:
                 wrong_usage(f"no benchmark is called {name!r}; there are: {', '.join(BENCHMARKS)}")
         chosen = [BENCHMARKS[name] for name in dict.fromkeys(names or BENCHMARKS)]
+        if lenses is not None and not any(benchmark.takes_lenses for benchmark in chosen):
+            wrong_usage("--lenses is for the benchmark lens")
         out = Path(json_out) if json_out not in (None, "-") else None
         check_out(out)
         check_out(report)
         documents = []
         sections = []
         for benchmark in chosen:
-            rows = _run(benchmark, quick)
+            rows = _run(benchmark, quick, lenses)
             documents.append({"name": benchmark.name, "machine": machine(), "rows": _finite(rows)})
             columns = benchmark.columns(rows)
             sections.append(BenchSection(benchmark.name, benchmark.title, rows, columns, benchmark.plots))
@@ -60,9 +67,14 @@ def bench(
             say(f"figures: {out}")
 
 
-def _run(benchmark: Benchmark, quick: bool) -> list[Row]:
+def _run(benchmark: Benchmark, quick: bool, lenses: Path | None) -> list[Row]:
     with progress_bar(f"bench {benchmark.name}") as show:
-        return benchmark.run(quick=quick, progress=lambda share: show(share, benchmark.title))
+        try:
+            return benchmark.run(quick=quick, progress=lambda share: show(share, benchmark.title), lenses=lenses)
+        except ValueError as error:
+            if lenses is None:
+                raise
+            raise DocumentError(str(error)) from error
 
 
 def _show(benchmark: Benchmark, rows: list[Row]) -> None:

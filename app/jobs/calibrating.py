@@ -31,12 +31,15 @@ from app.jobs.provenance import provenance_of_job
 from app.jobs.sweep import LevelPlan, SweepPlan, level_task
 from app.jobs.taking import PictureTaker
 from app.jobs.work import HOME_BOUND_S, Ending, JobTools, JobWorkFailed, Subject
+from app.lens_at import SURFACE_KIND, surface_fit
 from calibration.compare import Overlay, predicted_overlay
+from calibration.errors import CalibrationError
 from calibration.solve.alternating import AlternatingMethod
 from calibration.solve.engine_model import Direction, EngineModel
 from calibration.solve.joint import JointMethod, JointOptions
 from calibration.solve.search import LevelMethod, LevelTask
-from calibration.tables import LensTable, LevelResult, LevelStatus
+from calibration.surface.plan import AdaptivePlan
+from calibration.tables import Interpolation, LensTable, LevelResult, LevelStatus
 from calibration.types import TargetKind
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import LensValues, RenderEngine
@@ -116,7 +119,19 @@ def subject(request: JobRequest) -> Subject:
 
 def make_plan(request: JobRequest) -> LevelPlan:
     """The plan that a job asks for: which levels, in which order."""
-    return SweepPlan([(level.zoom, level.focus) for level in request.levels])
+    if request.plan is None:
+        return SweepPlan([(level.zoom, level.focus) for level in request.levels])
+    return AdaptivePlan(request.plan.to_options(), request.image_size, request.pixel_aspect)
+
+
+def _held_out(table: LensTable) -> tuple[LensTable, list[str]]:
+    """The table with how far its surface is off at levels left out of it, and what is odd about single levels."""
+    try:
+        fit = surface_fit(table)
+    except CalibrationError as error:
+        return table, [f"the levels make no surface: {error}"]
+    told = [f"zoom {c.zoom:g}, focus {c.focus:g} does not fit its neighbours: {c.reason}" for c in fit.left_out]
+    return replace(table, interpolation=Interpolation(SURFACE_KIND, fit.held_out_px)), told
 
 
 class Calibration:
@@ -126,6 +141,7 @@ class Calibration:
         self._request = request
         self._tools = tools
         self._results: list[LevelResult] = []
+        self._attempts: dict[tuple[float, float], int] = {}
         self._drawing = _Background()
 
     async def run(self, lease: Lease) -> None:
@@ -151,7 +167,7 @@ class Calibration:
         told, failures = len(request.levels), 0
         problem: AdapterError | None = None
         while asked:
-            known = len(self._results) + len(asked)
+            known = len(self._results) + len([place for place in asked if place not in self._attempts])
             if known > told:
                 told = known
                 await tools.event(LevelsPlanned(levels=known))
@@ -159,10 +175,12 @@ class Calibration:
                 if failures >= _STUDIO_FAILURES:
                     left = known - len(self._results)
                     raise EngineError(f"{problem} ({failures} levels in a row failed so; {left} levels were not tried)")
-                problem = await self._one(zoom, focus, model, taker, lease, as_found)
+                result, problem = await self._one(zoom, focus, model, taker, lease, as_found)
                 failures = failures + 1 if problem is not None else 0
-                await tools.cpu.run(plan.tell, self._results[-1])
+                await tools.cpu.run(plan.tell, result)
             asked = await tools.cpu.run(plan.ask)
+        if plan.reason is not None:
+            await tools.event(Note(text=f"the plan ends: {plan.reason}"))
         try:
             async with asyncio.timeout(HOME_BOUND_S):
                 await taker.home(stood)
@@ -177,21 +195,29 @@ class Calibration:
         taker: PictureTaker,
         lease: Lease,
         as_found: LensValues | None,
-    ) -> AdapterError | None:
-        """Measure and commit the next level; gives what was wrong with the studio, if that is why it failed."""
-        request, ordinal = self._request, len(self._results)
-        await self._tools.event(LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus))
-        task = level_task(request, zoom, focus, self._results, model)
+    ) -> tuple[LevelResult, AdapterError | None]:
+        """Measure and commit a level, a further attempt at one that was measured before in its place; gives what was
+        wrong with the studio, if that is why it failed."""
+        request = self._request
+        attempt = self._attempts[zoom, focus] = self._attempts.get((zoom, focus), 0) + 1
+        places = [(result.zoom, result.focus) for result in self._results]
+        ordinal = places.index((zoom, focus)) if attempt > 1 else len(self._results)
+        await self._tools.event(LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus, attempt=attempt))
+        others = [result for result in self._results if (result.zoom, result.focus) != (zoom, focus)]
+        task = level_task(request, zoom, focus, others, model)
         method = make_method(request, task)
         outcome, problem = await self._level(ordinal, method, task, taker, lease)
         outcome, evidence = await self._tools.cpu.run(_with_evidence, outcome, method, task)
-        self._results.append(outcome.result)
+        if attempt == 1:
+            self._results.append(outcome.result)
+        elif outcome.result.status is not LevelStatus.FAILED:
+            self._results[ordinal] = outcome.result
         pictures = partial(_pictures, outcome, method, task, request.pixel_aspect, as_found)
-        await self._commit(ordinal, outcome.result, evidence)
+        await self._commit(ordinal, outcome.result, evidence, attempt)
         # Drawn while the next level is measured; one level's pictures at a time are held in memory.
         await self._drawing.finish()
         self._drawing.begin(self._draw(ordinal, pictures))
-        return problem
+        return outcome.result, problem
 
     async def _learn(self, studio: Studio, taker: PictureTaker, first: tuple[float, float]) -> EngineModel:
         """How the engine draws; what of it contradicts the studio profile is told, never silently followed."""
@@ -243,14 +269,16 @@ class Calibration:
             reason = f"internal error ({type(error).__name__}); the log has the details"
             return LevelOutcome(LevelResult.failed(task.zoom, task.focus, reason), None, None, ()), None
 
-    async def _commit(self, ordinal: int, result: LevelResult, evidence: str | None) -> None:
+    async def _commit(self, ordinal: int, result: LevelResult, evidence: str | None, attempt: int) -> None:
         event: AnyEvent
         if result.status is LevelStatus.FAILED:
             reason = result.reason or "unknown"
-            event = LevelFailed(ordinal=ordinal, zoom=result.zoom, focus=result.focus, reason=reason)
+            event = LevelFailed(ordinal=ordinal, zoom=result.zoom, focus=result.focus, reason=reason, attempt=attempt)
         else:
-            event = LevelDone.of(ordinal, result)
-        await self._tools.repository.save_level(self._tools.job_id, ordinal, result, draft(event), evidence=evidence)
+            event = LevelDone.of(ordinal, result, attempt)
+        await self._tools.repository.save_level(
+            self._tools.job_id, ordinal, result, draft(event), evidence=evidence, attempt=attempt
+        )
         self._tools.notify()
 
     async def _draw(self, ordinal: int, pictures: Callable[[], dict[PictureKind, bytes]]) -> None:
@@ -282,6 +310,9 @@ class Calibration:
             pixel_aspect=request.pixel_aspect,
             provenance=provenance_of_job(self._tools.job_id, levels, self._tools.profile),
         )
+        table, told = await self._tools.cpu.run(_held_out, table)
+        for text in told:
+            await self._tools.event(Note(text=text))
         summary = await self._tools.repository.save_table(self._tools.job_id, table)
         return Ending(JobDone(table_id=summary.id), reason)
 

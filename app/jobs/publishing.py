@@ -23,7 +23,6 @@ from app.events import (
 )
 from app.job_documents import PublishRequest, parse_job
 from app.jobs.engine import learn
-from app.jobs.sweep import order
 from app.jobs.taking import PictureTaker, observe
 from app.jobs.work import HOME_BOUND_S, Ending, JobTools, JobWorkFailed, Subject
 from app.lens_at import lens_at, level_near
@@ -32,6 +31,7 @@ from calibration.lens import Lens
 from calibration.solve.engine_model import IDENTITY, Direction, EngineModel
 from calibration.solve.render_check import RenderAgreement, RenderCheck
 from calibration.solve.search import LevelTask
+from calibration.surface.plan import in_order
 from calibration.tables import LensTable, LevelResult
 from engine_adapters.errors import AdapterError
 from engine_adapters.ports import HeadState, ReadBack
@@ -78,7 +78,7 @@ async def subject(request: PublishRequest, repository: Repository) -> Subject:
 def _usable(table: LensTable) -> list[LevelResult]:
     """Levels with a lens, in the order of a sweep."""
     levels = {(level.zoom, level.focus): level for level in table.levels if level.fov_x_deg is not None}
-    return [levels[place] for place in order(list(levels))]
+    return [levels[place] for place in in_order(list(levels))]
 
 
 class Publication:

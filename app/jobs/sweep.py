@@ -9,26 +9,20 @@ from app.documents import JobRequest
 from calibration.lens import Lens
 from calibration.solve.engine_model import IDENTITY, EngineModel
 from calibration.solve.search import LevelTask
+from calibration.surface.plan import in_order
 from calibration.tables import LevelResult, LevelStatus
 
 _NODAL_CHANGE_MM = 100.0
 # How much the pupil of a zoom lens moves between neighbouring levels, generously.
 
 
-def order(levels: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Zoom by zoom, the focuses there and back again, so that the lens travels little."""
-    by_zoom: dict[float, list[float]] = {}
-    for zoom, focus in levels:
-        by_zoom.setdefault(zoom, []).append(focus)
-    ordered: list[tuple[float, float]] = []
-    for index, zoom in enumerate(sorted(by_zoom)):
-        focuses = sorted(by_zoom[zoom], reverse=index % 2 == 1)
-        ordered += [(zoom, focus) for focus in focuses]
-    return ordered
-
-
 class LevelPlan(Protocol):
-    """Which levels a job measures, and in which order: an ask/tell object, called in threads, one call at a time."""
+    """Which levels a job measures, and in which order: an ask/tell object, called in threads, one call at a time.
+
+    ``reason``: why it is done, None while it is not or where there is nothing to say.
+    """
+
+    reason: str | None
 
     def ask(self) -> list[tuple[float, float]]:
         """The levels (zoom, focus) to measure next, in this order; empty: the plan is done.
@@ -44,10 +38,11 @@ class LevelPlan(Protocol):
 
 
 class SweepPlan:
-    """Every level that was listed, in the order of :func:`order`."""
+    """Every level that was listed, in the order of :func:`calibration.surface.plan.in_order`."""
 
     def __init__(self, levels: Sequence[tuple[float, float]]) -> None:
-        self._left = order(levels)
+        self._left = in_order(levels)
+        self.reason: str | None = None
 
     def ask(self) -> list[tuple[float, float]]:
         """All of them, once."""

@@ -109,9 +109,9 @@ def find_outliers(data: LevelData, prior: PriorMean | None) -> dict[int, tuple[L
         for place in suspects:
             level = kept[int(place)]
             # The smoothness is learned again without it: with it, a wrong level makes every lens look rough.
-            others = LensModel.fit(data.only([i for i in kept if i != level]), prior)
+            others = LensModel.fit(data.only([i for i in kept if i != level]), prior, like=model)
             found = against(others, data, level)
-            chance = chance_of(found, len(kept) - 1)
+            chance = chance_of(found, others.spare)
             if worst is None or chance < worst[0]:
                 worst = (chance, level, others, found)
         if worst is None or worst[0] >= REJECTED_CHANCE / len(data) or worst[3].error_px < HARMLESS_PX:
@@ -128,11 +128,11 @@ def against(model: LensModel, data: LevelData, level: int) -> LevelMisfit:
     return misfit(data.values[level] - model.mean(*place)[0], covariance, data.values[level], data.image_size)
 
 
-def chance_of(found: LevelMisfit, levels: int) -> float:
-    """Chance of a larger misfit against a surface whose smoothness ``levels`` levels have told."""
+def chance_of(found: LevelMisfit, spare: int) -> float:
+    """Chance of a larger misfit against a surface whose smoothness was learned from ``spare`` degrees of freedom."""
     size = len(QUANTITIES)
     chi2 = float(found.residual @ np.linalg.solve(found.covariance, found.residual))
-    return float(stats.f.sf(chi2 / size, size, max(levels - 3, 1)))
+    return float(stats.f.sf(chi2 / size, size, max(spare, 1)))
 
 
 def _require_consistent(data: LevelData) -> None:
@@ -184,7 +184,7 @@ def _explain(model: LensModel, data: LevelData, level: int, found: LevelMisfit) 
     rest = data.values[level] - means
     chi2 = np.einsum("ni,ni->n", rest, np.linalg.solve(covariances, rest[..., None])[..., 0])
     best = int(np.argmin(chi2))
-    fits = stats.f.sf(chi2[best] / len(QUANTITIES), len(QUANTITIES), max(len(data) - 4, 1)) > _ARRIVED
+    fits = stats.f.sf(chi2[best] / len(QUANTITIES), len(QUANTITIES), max(model.spare, 1)) > _ARRIVED
     if fits and abs(along[best] - zoom) > 0.01:
         return (
             f"{told}: its numbers are those of zoom {along[best]:.3f}; the lens had not arrived, or its encoder slipped"
@@ -222,7 +222,7 @@ def _checks(
             checks.append(LevelCheck(level.zoom, level.focus, True, reason="too few levels to compare with"))
         else:
             found = model.misfits[in_model[place]]
-            chance = chance_of(found, len(kept) - 1)
+            chance = chance_of(found, model.spare)
             checks.append(LevelCheck(level.zoom, level.focus, True, found.error_px, found.expected_px, chance))
     return tuple(checks)
 

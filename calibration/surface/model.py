@@ -73,8 +73,11 @@ class LensModel:
     misfits: tuple[LevelMisfit, ...]
 
     @classmethod
-    def fit(cls, data: LevelData, prior: PriorMean | None = None) -> LensModel:
-        """The model of a lens's levels. Raises :class:`calibration.errors.NotConverged`."""
+    def fit(cls, data: LevelData, prior: PriorMean | None = None, like: LensModel | None = None) -> LensModel:
+        """The model of a lens's levels. ``like``: of nearly the same levels, whose scale and coordinates are kept.
+
+        Raises :class:`calibration.errors.NotConverged`.
+        """
         places = (data.zoom, data.focus)
         values = data.values if prior is None else data.values - prior(*places)
         expected = _EXPECTED if prior is None else _EXPECTED_FROM_PRIOR
@@ -82,7 +85,11 @@ class LensModel:
         noise = data.covariance
         zooms = float(np.ptp(data.values[:, 0])) > math.log(_ZOOMS)
         power, focal = 0.0, _smooth(places, values[:, 0] - log_f0, noise[:, 0, 0], expected[0])
-        if prior is None and zooms:
+        if like is not None and like.power != 0.0:
+            power = like.power
+            scaled, slope = _to_power(values[:, 0] - log_f0, power)
+            focal = _smooth(places, scaled, noise[:, 0, 0] * slope**2, expected[0])
+        elif like is None and prior is None and zooms:
             for candidate in _POWERS[1:]:
                 scaled, slope = _to_power(values[:, 0] - log_f0, candidate)
                 found = _smooth(places, scaled, noise[:, 0, 0] * slope**2, expected[0])
@@ -96,7 +103,10 @@ class LensModel:
             data.focus,
         )
 
-        def chosen(columns: Sequence[int]) -> tuple[bool, list[Smoothness]]:
+        def chosen(columns: Sequence[int], kept: bool | None) -> tuple[bool, list[Smoothness]]:
+            if kept is not None:
+                at = by_f if kept else places
+                return kept, [_smooth(at, values[:, i], noise[:, i, i], expected[i]) for i in columns]
             plain = [_smooth(places, values[:, i], noise[:, i, i], expected[i]) for i in columns]
             if prior is not None or not zooms:
                 return False, plain
@@ -104,8 +114,8 @@ class LensModel:
             gain = sum(b.log_likelihood - a.log_likelihood for a, b in zip(plain, other, strict=True))
             return (True, other) if gain > _BETTER else (False, plain)
 
-        optics_by_f, distortion = chosen((1, 2))
-        shift_by_f, shifts = chosen((3, 4))
+        optics_by_f, distortion = chosen((1, 2), None if like is None else like.follows_f[0])
+        shift_by_f, shifts = chosen((3, 4), None if like is None else like.follows_f[1])
         optics_at = by_f if optics_by_f else places
         to_scale = np.ones((len(data), 3))
         to_scale[:, 0] = slope
@@ -130,10 +140,15 @@ class LensModel:
             _nodal(data),
             (),
         )
-        spare = len(data) - max(len(s.trend.at(*_ORIGIN)[0]) for s in (*optics.smooth, *shift.smooth))
-        if spare < 2:
+        if model.spare < 2:
             return model  # without a level its trend could not be drawn, so none can be compared with the others
         return replace(model, misfits=tuple(model._misfit(i) for i in range(len(data))))
+
+    @property
+    def spare(self) -> int:
+        """How many levels there are beyond those that the trends take: what the smoothness is learned from."""
+        smooth = (*self.optics.smooth, *self.shift.smooth)
+        return len(self.data) - max(len(s.trend.at(*_ORIGIN)[0]) for s in smooth)
 
     def mean(self, zoom: FloatArray, focus: FloatArray) -> FloatArray:
         """The quantities (N, 5) at places (N,)."""

@@ -97,16 +97,23 @@ class LevelData:
     @classmethod
     def of(cls, table: LensTable) -> LevelData:
         """The numbers of a table. Raises :class:`InvalidInput` when no level has a lens."""
-        told = [i for i, level in enumerate(table.levels) if level.fov_x_deg is not None]
+        return cls.of_levels(table.levels, table.image_size, table.pixel_aspect)
+
+    @classmethod
+    def of_levels(
+        cls, results: Sequence[LevelResult], image_size: tuple[int, int], pixel_aspect: float = 1.0
+    ) -> LevelData:
+        """The same of levels that are no table yet."""
+        told = [i for i, level in enumerate(results) if level.fov_x_deg is not None]
         if not told:
-            raise InvalidInput("levels", len(table.levels), "none of them has a field of view; measure them again")
-        levels = [table.levels[i] for i in told]
-        lenses = [level.lens(table.image_size, table.pixel_aspect) for level in levels]
+            raise InvalidInput("levels", len(results), "none of them has a field of view; measure them again")
+        levels = [results[i] for i in told]
+        lenses = [level.lens(image_size, pixel_aspect) for level in levels]
         nodal = np.array([np.nan if v.nodal_offset_mm is None else v.nodal_offset_mm for v in levels])
         sigma = np.array([np.nan if v.sigma.nodal_offset_mm is None else v.sigma.nodal_offset_mm for v in levels])
         return cls(
-            table.image_size,
-            table.pixel_aspect,
+            image_size,
+            pixel_aspect,
             tuple(told),
             np.array([level.zoom for level in levels]),
             np.array([level.focus for level in levels]),
