@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from app.errors import TooManyListeners
 from calibration.solve.engine_fit import LearnedEngine
+from calibration.surface.recheck import Recheck, Verdict
 from calibration.tables import LevelResult, PixelError
 from storage.records import EventDraft, EventRecord
 from storage.schemas import format_utc
@@ -50,7 +51,7 @@ class JobQueued(Event):
     """The job is stored and waits for its engine."""
 
     kind: Literal["job_queued"] = "job_queued"
-    job: str = Field(default="calibrate", description="what kind of job it is: calibrate, publish ...")
+    job: str = Field(default="calibrate", description="what kind of job it is: calibrate, publish, recheck")
     lens: str
     camera: str
     engine: str
@@ -284,6 +285,63 @@ class Published(Event):
     reason: str | None = Field(default=None, description="why it failed, or what was not checked")
 
 
+class CheckedLevelData(BaseModel):
+    """A level that was measured again, against the stored lens."""
+
+    model_config = ConfigDict(frozen=True)
+
+    zoom: Number
+    focus: Number
+    error_px: Number = Field(description="largest overlay error of the stored lens over the frame, px")
+    expected_px: Number = Field(description="one sigma of it, for a lens that holds, px")
+    left_px: Number | None = Field(default=None, description="what the correction leaves of it, px; null: none")
+
+
+class RemountData(BaseModel):
+    """What a remount moved, new minus stored; null: not needed to explain what was measured."""
+
+    model_config = ConfigDict(frozen=True)
+
+    center_shift_px: tuple[Number, Number] | None = None
+    center_shift_sigma_px: tuple[Number, Number] | None = None
+    zoom_offset: Number | None = Field(default=None, description="of the encoder value of the same ring position")
+    zoom_offset_sigma: Number | None = None
+    focus_offset: Number | None = Field(default=None, description="of the encoder value of the same ring position")
+    focus_offset_sigma: Number | None = None
+
+
+class Rechecked(Event):
+    """How a stored lens stands after a re-check."""
+
+    kind: Literal["rechecked"] = "rechecked"
+    engine: str
+    table_id: int | None = Field(default=None, description="the stored table; null: it came with the job")
+    verdict: Verdict = Field(description="holds; corrected: a remount explains the change; changed: nothing does")
+    goal_px: Number
+    error_px: Number = Field(description="of the stored lens at the worst level, px")
+    left_px: Number | None = Field(default=None, description="the same after the correction, px; null: none")
+    remount: RemountData | None = Field(default=None, description="the correction; null: none")
+    levels: tuple[CheckedLevelData, ...]
+    corrected_table_id: int | None = Field(default=None, description="the corrected table where it was stored")
+    reason: Reason
+
+    @classmethod
+    def of(cls, engine: str, table_id: int | None, found: Recheck, corrected_table_id: int | None) -> Rechecked:
+        """The event of what was found."""
+        return cls(
+            engine=engine,
+            table_id=table_id,
+            verdict=found.verdict,
+            goal_px=found.goal_px,
+            error_px=found.error_px,
+            left_px=found.left_px,
+            remount=None if found.remount is None else RemountData(**asdict(found.remount)),
+            levels=tuple(CheckedLevelData(**asdict(level)) for level in found.levels),
+            corrected_table_id=corrected_table_id,
+            reason=found.reason,
+        )
+
+
 class EngineRestored(Event):
     """The engine has its values back as they were found, but for those that the job leaves in it on purpose."""
 
@@ -346,6 +404,7 @@ AnyEvent = Annotated[
     | EngineLearned
     | PlaceChecked
     | Published
+    | Rechecked
     | EngineRestored
     | EngineDirty
     | JobDone

@@ -27,6 +27,7 @@ from app.jobs.engine import learn
 from app.jobs.evidence import evidence_or_none
 from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
+from app.jobs.prior import prior_surface
 from app.jobs.provenance import provenance_of_job
 from app.jobs.sweep import LevelPlan, SweepPlan, level_task
 from app.jobs.taking import PictureTaker
@@ -38,6 +39,7 @@ from calibration.solve.alternating import AlternatingMethod
 from calibration.solve.engine_model import Direction, EngineModel
 from calibration.solve.joint import JointMethod, JointOptions
 from calibration.solve.search import LevelMethod, LevelTask
+from calibration.surface import LensSurface
 from calibration.surface.plan import AdaptivePlan
 from calibration.tables import Interpolation, LensTable, LevelResult, LevelStatus
 from calibration.types import TargetKind
@@ -137,12 +139,19 @@ def _held_out(table: LensTable) -> tuple[LensTable, list[str]]:
 class Calibration:
     """The work (:class:`app.jobs.work.JobWork`) of a calibration job."""
 
-    def __init__(self, request: JobRequest, tools: JobTools) -> None:
+    def __init__(self, request: JobRequest, tools: JobTools, prior: LensSurface | None = None) -> None:
+        """``prior``: the lens that levels start from, None: as the request says."""
         self._request = request
         self._tools = tools
+        self._prior = prior
         self._results: list[LevelResult] = []
         self._attempts: dict[tuple[float, float], int] = {}
         self._drawing = _Background()
+
+    @property
+    def results(self) -> tuple[LevelResult, ...]:
+        """The levels measured so far, failed ones too."""
+        return tuple(self._results)
 
     async def run(self, lease: Lease) -> None:
         """Measure the levels that the plan asks for."""
@@ -154,6 +163,8 @@ class Calibration:
 
     async def _measure(self, lease: Lease) -> None:
         request, tools = self._request, self._tools
+        if self._prior is None:
+            self._prior = await prior_surface(request, tools.repository)
         as_found = await _lens_as_found(lease.studio.engine)
         taker = PictureTaker(lease.studio, request.image_size, tools.cpu)
         stood = await taker.read_head()
@@ -176,6 +187,9 @@ class Calibration:
                     left = known - len(self._results)
                     raise EngineError(f"{problem} ({failures} levels in a row failed so; {left} levels were not tried)")
                 result, problem = await self._one(zoom, focus, model, taker, lease, as_found)
+                if self._prior is not None and problem is None and result.status is LevelStatus.FAILED:
+                    # Perhaps it is another lens than the table's: once more, without it.
+                    result, problem = await self._one(zoom, focus, model, taker, lease, as_found)
                 failures = failures + 1 if problem is not None else 0
                 await tools.cpu.run(plan.tell, result)
             asked = await tools.cpu.run(plan.ask)
@@ -204,7 +218,7 @@ class Calibration:
         ordinal = places.index((zoom, focus)) if attempt > 1 else len(self._results)
         await self._tools.event(LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus, attempt=attempt))
         others = [result for result in self._results if (result.zoom, result.focus) != (zoom, focus)]
-        task = level_task(request, zoom, focus, others, model)
+        task = level_task(request, zoom, focus, others, model, self._prior if attempt == 1 else None)
         method = make_method(request, task)
         outcome, problem = await self._level(ordinal, method, task, taker, lease)
         outcome, evidence = await self._tools.cpu.run(_with_evidence, outcome, method, task)

@@ -338,7 +338,7 @@ class _Check:
         cost, normal = math.inf, np.zeros((len(used), len(used)))
         for _ in range(2):
             # Weights at the place found before, so that the sum minimised is of one set of weights.
-            weights = np.linalg.inv(self.covariances(values))
+            weights = np.asarray(np.linalg.inv(self.covariances(values)), dtype=np.float64)
             values, cost, normal = self._descend(values, used, weights)
         scaled = normal * np.outer(most, most)
         known = bool(np.linalg.eigvalsh(scaled)[0] > _LEAST_TOLD)
@@ -391,7 +391,7 @@ class _Check:
 
     def _start(self, used: list[int]) -> FloatArray:
         """The best of a few zoom offsets, each with the centre shift that suits it."""
-        weights = np.linalg.inv(self.covariances(np.zeros(4)))
+        weights = np.asarray(np.linalg.inv(self.covariances(np.zeros(4))), dtype=np.float64)
         best, least = np.zeros(4), math.inf
         for zoom in np.linspace(-0.9, 0.9, _STARTS) * MOST_ZOOM if 2 in used else (0.0,):
             values = np.array([0.0, 0.0, float(zoom), 0.0])
@@ -423,7 +423,8 @@ def _is_certain(values: FloatArray, covariance: FloatArray, part: tuple[int, ...
 
 def _jacobian(lens: Lens) -> FloatArray:
     rays = frame_rays(lens)
-    return picture_jacobian(np.array([lens.k1_hw]), np.array([lens.k2_hw]), rays, lens.image_size)[0]
+    jacobian = picture_jacobian(np.array([lens.k1_hw]), np.array([lens.k2_hw]), rays, lens.image_size)
+    return np.asarray(jacobian[0])
 
 
 def _floor(jacobian: FloatArray) -> FloatArray:
