@@ -21,14 +21,13 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from app.errors import TooManyListeners
+from app.event_data import CheckedLevelData, Count, EngineModelData, FramesData, Number, RemountData
 from calibration.solve.engine_fit import LearnedEngine
 from calibration.surface.recheck import Recheck, Verdict
 from calibration.tables import LevelResult, PixelError
 from storage.records import EventDraft, EventRecord
 from storage.schemas import format_utc
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Reason = Annotated[str, Field(min_length=1, description="one line: what, where, what to do")]
 
@@ -133,15 +132,6 @@ class PixelErrorData(BaseModel):
         return None if error is None else cls(rms=error.rms, max=error.max)
 
 
-class FramesData(BaseModel):
-    """How many pictures a level took."""
-
-    model_config = ConfigDict(frozen=True)
-
-    real: Count = Field(description="of the camera")
-    virtual: Count = Field(description="of the engine's own render")
-
-
 class LevelDone(LevelEvent):
     """A level is measured and stored. null: not told, the stored level has the reason."""
 
@@ -191,22 +181,6 @@ class LevelFailed(LevelEvent):
     kind: Literal["level_failed"] = "level_failed"
     attempt: int = Field(default=1, ge=1, description="counts from 1")
     reason: Reason
-
-
-class EngineModelData(BaseModel):
-    """How an engine draws, against a profile that is right: all gains 1, offsets 0, ``unit_power`` 0."""
-
-    model_config = ConfigDict(frozen=True)
-
-    direction: Literal["undistorted_to_distorted", "reverse"]
-    unit_power: int = Field(description="1 or -1: k1 grows with the focal length squared, or its inverse, besides")
-    focal_gain: Number
-    k1_gain: Number
-    k2_gain: Number
-    shift_gain: tuple[Number, Number]
-    shift_offset_px: tuple[Number, Number]
-    nodal_gain: Number
-    aspect_gain: Number
 
 
 class EngineLearned(Event):
@@ -283,31 +257,6 @@ class Published(Event):
     values: tuple[ValueData, ...] = Field(default=(), description="what the engine holds for the place")
     render_px: PixelErrorData | None = Field(default=None, description="worst of all places, px; null: not compared")
     reason: str | None = Field(default=None, description="why it failed, or what was not checked")
-
-
-class CheckedLevelData(BaseModel):
-    """A level that was measured again, against the stored lens."""
-
-    model_config = ConfigDict(frozen=True)
-
-    zoom: Number
-    focus: Number
-    error_px: Number = Field(description="largest overlay error of the stored lens over the frame, px")
-    expected_px: Number = Field(description="one sigma of it, for a lens that holds, px")
-    left_px: Number | None = Field(default=None, description="what the correction leaves of it, px; null: none")
-
-
-class RemountData(BaseModel):
-    """What a remount moved, new minus stored; null: not needed to explain what was measured."""
-
-    model_config = ConfigDict(frozen=True)
-
-    center_shift_px: tuple[Number, Number] | None = None
-    center_shift_sigma_px: tuple[Number, Number] | None = None
-    zoom_offset: Number | None = Field(default=None, description="of the encoder value of the same ring position")
-    zoom_offset_sigma: Number | None = None
-    focus_offset: Number | None = Field(default=None, description="of the encoder value of the same ring position")
-    focus_offset_sigma: Number | None = None
 
 
 class Rechecked(Event):
