@@ -20,7 +20,10 @@ from calibration.camera import target_rotation
 from calibration.errors import CalibrationError
 from calibration.solve.mistakes import Priors
 from calibration.surface.plan import PlanOptions
+from calibration.tables import LensTable
 from calibration.types import CameraPose, Role, Target, TargetKind, TargetPose
+from storage.errors import BadDocument
+from storage.schemas import LensTableDocument, document_to_table
 
 _NEAREST_M = 0.01
 _EDGE_ON = 0.05
@@ -46,6 +49,7 @@ Side = Annotated[int, Field(ge=16, le=32768)]
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 Unit = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+TableId = Annotated[int, Field(ge=1, le=2**53)]
 
 
 class DocumentError(Exception):
@@ -226,6 +230,14 @@ def check_room(targets: Mapping[str, TargetModel], pivot_m: tuple[float, float, 
         _check_faces(name, target.pose, pivot_m)
 
 
+def read_table(document: LensTableDocument, field: str) -> LensTable:
+    """The lens table that stands in a job. Raises ValueError for one that is no lens table."""
+    try:
+        return document_to_table(document.model_dump(mode="json"))
+    except BadDocument as error:
+        raise ValueError(f"{field}: {error}") from error
+
+
 class PlanModel(Strict):
     """Levels chosen where the overlay error between them is expected to be worst, until it is small enough."""
 
@@ -274,6 +286,11 @@ class JobRequest(Strict):
     plan: PlanModel | None = Field(
         default=None, description="chooses the levels as it goes, instead of levels; null: the levels are listed"
     )
+    start_from: TableId | LensTableDocument | None = Field(
+        default=None,
+        description="lens table that levels start from, of this lens or one of its type and of the same picture: the "
+        "id of a stored one, or the table itself",
+    )
     targets: dict[Name, TargetModel] = Field(min_length=1, description="surveyed targets: each needs its pose")
     pivot_m: tuple[Finite, Finite, Finite] = Field(description="where the camera's pivot stands")
     pivot_sigma_m: NotNegative = 0.0
@@ -302,6 +319,8 @@ class JobRequest(Strict):
             if (level.zoom, level.focus) in seen:
                 raise ValueError(f"levels[{index}] (zoom {level.zoom:g}, focus {level.focus:g}) is listed twice")
             seen.add((level.zoom, level.focus))
+        if isinstance(self.start_from, LensTableDocument):
+            read_table(self.start_from, "start_from")
         return self
 
 

@@ -21,13 +21,13 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from app.errors import TooManyListeners
+from app.event_data import CheckedLevelData, Count, EngineModelData, FramesData, Number, RemountData
 from calibration.solve.engine_fit import LearnedEngine
+from calibration.surface.recheck import Recheck, Verdict
 from calibration.tables import LevelResult, PixelError
 from storage.records import EventDraft, EventRecord
 from storage.schemas import format_utc
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Reason = Annotated[str, Field(min_length=1, description="one line: what, where, what to do")]
 
@@ -50,7 +50,7 @@ class JobQueued(Event):
     """The job is stored and waits for its engine."""
 
     kind: Literal["job_queued"] = "job_queued"
-    job: str = Field(default="calibrate", description="what kind of job it is: calibrate, publish ...")
+    job: str = Field(default="calibrate", description="what kind of job it is: calibrate, publish, recheck")
     lens: str
     camera: str
     engine: str
@@ -132,15 +132,6 @@ class PixelErrorData(BaseModel):
         return None if error is None else cls(rms=error.rms, max=error.max)
 
 
-class FramesData(BaseModel):
-    """How many pictures a level took."""
-
-    model_config = ConfigDict(frozen=True)
-
-    real: Count = Field(description="of the camera")
-    virtual: Count = Field(description="of the engine's own render")
-
-
 class LevelDone(LevelEvent):
     """A level is measured and stored. null: not told, the stored level has the reason."""
 
@@ -190,22 +181,6 @@ class LevelFailed(LevelEvent):
     kind: Literal["level_failed"] = "level_failed"
     attempt: int = Field(default=1, ge=1, description="counts from 1")
     reason: Reason
-
-
-class EngineModelData(BaseModel):
-    """How an engine draws, against a profile that is right: all gains 1, offsets 0, ``unit_power`` 0."""
-
-    model_config = ConfigDict(frozen=True)
-
-    direction: Literal["undistorted_to_distorted", "reverse"]
-    unit_power: int = Field(description="1 or -1: k1 grows with the focal length squared, or its inverse, besides")
-    focal_gain: Number
-    k1_gain: Number
-    k2_gain: Number
-    shift_gain: tuple[Number, Number]
-    shift_offset_px: tuple[Number, Number]
-    nodal_gain: Number
-    aspect_gain: Number
 
 
 class EngineLearned(Event):
@@ -284,6 +259,38 @@ class Published(Event):
     reason: str | None = Field(default=None, description="why it failed, or what was not checked")
 
 
+class Rechecked(Event):
+    """How a stored lens stands after a re-check."""
+
+    kind: Literal["rechecked"] = "rechecked"
+    engine: str
+    table_id: int | None = Field(default=None, description="the stored table; null: it came with the job")
+    verdict: Verdict = Field(description="holds; corrected: a remount explains the change; changed: nothing does")
+    goal_px: Number
+    error_px: Number = Field(description="of the stored lens at the worst level, px")
+    left_px: Number | None = Field(default=None, description="the same after the correction, px; null: none")
+    remount: RemountData | None = Field(default=None, description="the correction; null: none")
+    levels: tuple[CheckedLevelData, ...]
+    corrected_table_id: int | None = Field(default=None, description="the corrected table where it was stored")
+    reason: Reason
+
+    @classmethod
+    def of(cls, engine: str, table_id: int | None, found: Recheck, corrected_table_id: int | None) -> Rechecked:
+        """The event of what was found."""
+        return cls(
+            engine=engine,
+            table_id=table_id,
+            verdict=found.verdict,
+            goal_px=found.goal_px,
+            error_px=found.error_px,
+            left_px=found.left_px,
+            remount=None if found.remount is None else RemountData(**asdict(found.remount)),
+            levels=tuple(CheckedLevelData(**asdict(level)) for level in found.levels),
+            corrected_table_id=corrected_table_id,
+            reason=found.reason,
+        )
+
+
 class EngineRestored(Event):
     """The engine has its values back as they were found, but for those that the job leaves in it on purpose."""
 
@@ -346,6 +353,7 @@ AnyEvent = Annotated[
     | EngineLearned
     | PlaceChecked
     | Published
+    | Rechecked
     | EngineRestored
     | EngineDirty
     | JobDone

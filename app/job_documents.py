@@ -7,14 +7,28 @@ here, in :data:`AnyJob` and :data:`KINDS`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, model_validator
 
-from app.documents import Finite, JobRequest, Name, Positive, Strict, TargetModel, Unit, check_room
+from app.documents import (
+    Finite,
+    JobRequest,
+    LevelModel,
+    Name,
+    NotNegative,
+    Positive,
+    PriorsModel,
+    Strict,
+    TableId,
+    TargetModel,
+    Unit,
+    check_room,
+    read_table,
+)
+from calibration.surface.recheck import GOAL_PX
 from calibration.tables import LensTable
-from storage.errors import BadDocument
-from storage.schemas import LensTableDocument, document_to_table
+from storage.schemas import LensTableDocument
 
 CALIBRATE = "calibrate"
 """The kind of a document that names none."""
@@ -64,38 +78,92 @@ class PublishOptions(Strict):
         return None if self.zoom is None or self.focus is None else (self.zoom, self.focus)
 
 
-class PublishRequest(PublishOptions):
-    """A job that writes a lens table to an engine, reads it back and compares a render with it."""
+class _OfTable(Strict):
+    """Base of jobs about one lens table: a stored one, or one that comes along."""
 
-    job: Literal[1] = 1
-    kind: Literal["publish"]
-    table_id: Annotated[int, Field(ge=1, le=2**53)] | None = Field(default=None, description="a stored lens table")
+    table_id: TableId | None = Field(default=None, description="a stored lens table")
     table: LensTableDocument | None = Field(default=None, description="the lens table itself, instead of table_id")
 
     @model_validator(mode="after")
-    def _has_a_table(self) -> PublishRequest:
+    def _has_a_table(self) -> Self:
         if (self.table_id is None) == (self.table is None):
             raise ValueError("give either table_id or table")
-        if self.table is not None:
-            self.to_table()
+        self.to_table()
         return self
 
     def to_table(self) -> LensTable | None:
         """The table that came with the job, None for a stored one. Raises ValueError for one that is no lens table."""
-        if self.table is None:
-            return None
-        try:
-            return document_to_table(self.table.model_dump(mode="json"))
-        except BadDocument as error:
-            raise ValueError(f"table: {error}") from error
+        return None if self.table is None else read_table(self.table, "table")
 
 
-KINDS: Mapping[str, type[JobRequest] | type[PublishRequest]] = {CALIBRATE: JobRequest, "publish": PublishRequest}
+class PublishRequest(PublishOptions, _OfTable):
+    """A job that writes a lens table to an engine, reads it back and compares a render with it."""
+
+    job: Literal[1] = 1
+    kind: Literal["publish"]
+
+
+class RecheckRequest(_OfTable):
+    """A job that measures a stored lens again at a few places and says whether it still holds."""
+
+    job: Literal[1] = 1
+    kind: Literal["recheck"]
+    engine: Name = Field(default="default", description="name of the studio profile's engine; one job at a time on it")
+    levels: list[LevelModel] = Field(
+        default_factory=list,
+        max_length=20,
+        description="places to measure, two or three are enough; none: near both ends of the zoom and where the table "
+        "is known least between, at the middle focus",
+    )
+    targets: dict[Name, TargetModel] = Field(
+        default_factory=dict, description="surveyed targets; none: those of the job that made the table, with its room"
+    )
+    pivot_m: tuple[Finite, Finite, Finite] | None = Field(
+        default=None, description="where the camera's pivot stands; given together with targets"
+    )
+    pivot_sigma_m: NotNegative = 0.0
+    angle_sigma_deg: NotNegative = Field(default=0.0, description="the head's encoders, one sigma")
+    roll_sigma_deg: NotNegative | None = Field(
+        default=None, description="the head's roll from picture to picture, one sigma; null: as the other angles"
+    )
+    priors: PriorsModel = PriorsModel()
+    goal_px: Positive = Field(default=GOAL_PX, description="overlay error up to which the stored lens holds")
+    max_views: Annotated[int, Field(ge=2, le=100)] = 6
+    store: bool = Field(
+        default=False, description="store a corrected table as a new version, not approved; needs table_id"
+    )
+
+    @model_validator(mode="after")
+    def _can_be_checked(self) -> Self:
+        if bool(self.targets) != (self.pivot_m is not None):
+            raise ValueError("targets and pivot_m are given together, or neither")
+        if self.pivot_m is not None:
+            check_room(self.targets, self.pivot_m)
+        else:
+            alone = [name for name in _ROOM if getattr(self, name) != type(self).model_fields[name].default]
+            if alone:
+                raise ValueError(f"{alone[0]} is given together with targets and pivot_m")
+        if self.store and self.table_id is None:
+            raise ValueError("store needs table_id: a corrected table is stored as a version of a stored one")
+        places = [(level.zoom, level.focus) for level in self.levels]
+        for index, place in enumerate(places):
+            if place in places[:index]:
+                raise ValueError(f"levels[{index}] (zoom {place[0]:g}, focus {place[1]:g}) is listed twice")
+        return self
+
+
+_ROOM = ("pivot_sigma_m", "angle_sigma_deg", "roll_sigma_deg", "priors")
+
+KINDS: Mapping[str, type[JobRequest] | type[PublishRequest] | type[RecheckRequest]] = {
+    CALIBRATE: JobRequest,
+    "publish": PublishRequest,
+    "recheck": RecheckRequest,
+}
 """The model of each kind of job."""
 
 
 def _by_kind(document: Any) -> Any:
-    if isinstance(document, (JobRequest, PublishRequest)):
+    if isinstance(document, (JobRequest, PublishRequest, RecheckRequest)):
         return document
     if not isinstance(document, Mapping):
         raise ValueError("a job is a JSON object")
@@ -108,15 +176,16 @@ def _by_kind(document: Any) -> Any:
 
 
 AnyJob = Annotated[
-    JobRequest | PublishRequest, PlainValidator(_by_kind, json_schema_input_type=JobRequest | PublishRequest)
+    JobRequest | PublishRequest | RecheckRequest,
+    PlainValidator(_by_kind, json_schema_input_type=JobRequest | PublishRequest | RecheckRequest),
 ]
 """A job of any kind, validated by the model of its kind."""
 
 
-_JOBS: TypeAdapter[JobRequest | PublishRequest] = TypeAdapter(AnyJob)
+_JOBS: TypeAdapter[JobRequest | PublishRequest | RecheckRequest] = TypeAdapter(AnyJob)
 
 
-def parse_job(document: Mapping[str, Any]) -> JobRequest | PublishRequest:
+def parse_job(document: Mapping[str, Any]) -> JobRequest | PublishRequest | RecheckRequest:
     """A job as it was stored. Raises :class:`pydantic.ValidationError`."""
     return _JOBS.validate_python(dict(document))
 

@@ -17,6 +17,8 @@ SAME_PLACE = 1e-6
 SURFACE_KIND = "Gaussian process over zoom and focus"
 """How a table's ``interpolation.kind`` names the surface."""
 
+_NEAR = 0.02
+# Encoder steps from a measured level within which another lens's level has nothing to add.
 _KEPT_FITS = 8
 # A client that follows a zoom asks for the same table again and again; a surface takes about 4 MB.
 
@@ -59,22 +61,45 @@ def table_at(table: LensTable, zoom: float, focus: float) -> LensTable:
     if level is not None and level.fov_x_deg is not None:
         return replace(table, levels=(level,))
     surface = surface_fit(table).surface
-    lens = _inside(surface, zoom, focus)
+    _inside(surface, zoom, focus)
+    return replace(table, levels=(_interpolated(surface, zoom, focus, "between levels: interpolated, not measured"),))
+
+
+def completed_from(table: LensTable, prior: LensTable) -> LensTable:
+    """The table with a level more at each place of ``prior``, a lens of the same type, that it has none near: the
+    prior's lens, corrected by the difference that the measured levels show. They say that they were not measured.
+
+    So a table of few levels carries what it was made from. Raises :class:`calibration.errors.CalibrationError`.
+    """
+    surface = fit_surface(table, prior=surface_fit(prior).surface).surface
+    why = "not measured: from another lens's table, corrected by the levels that were"
+    (wide, tele), (far, near) = surface.zoom_range, surface.focus_range
+    added = [
+        _interpolated(surface, level.zoom, level.focus, why)
+        for level in prior.levels
+        if level.fov_x_deg is not None
+        and wide <= level.zoom <= tele
+        and far <= level.focus <= near
+        and all(abs(level.zoom - own.zoom) > _NEAR or abs(level.focus - own.focus) > _NEAR for own in table.levels)
+    ]
+    levels = sorted((*table.levels, *added), key=lambda level: (level.zoom, level.focus))
+    return replace(table, levels=tuple(levels))
+
+
+def _interpolated(surface: LensSurface, zoom: float, focus: float, why: str) -> LevelResult:
     found = surface.at(zoom, focus)
-    why = "between levels: interpolated, not measured"
     reasons = {name: why for name in EVIDENCE_QUANTITIES if name != "predicted_overlay_px"}
     if not found.nodal_told:
         reasons["nodal_offset_mm"] = "no level of the table tells it"
-    interpolated = LevelResult.from_lens(
+    return LevelResult.from_lens(
         zoom,
         focus,
-        lens,
+        found.lens,
         status=LevelStatus.OK,
         reasons=reasons,
         sigma=found.sigma,
         predicted_overlay_px=found.predicted_px,
     )
-    return replace(table, levels=(interpolated,))
 
 
 def _inside(surface: LensSurface, zoom: float, focus: float) -> Lens:

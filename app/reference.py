@@ -18,6 +18,7 @@ def pages() -> dict[str, str]:
         "events.schema.json": events.schema_text(),
         "job.schema.json": documents.schema_text(documents.JobRequest),
         "publish.schema.json": documents.schema_text(job_documents.PublishRequest),
+        "recheck.schema.json": documents.schema_text(job_documents.RecheckRequest),
         "level-evidence.schema.json": evidence_schema_text(),
         "openapi.json": main.openapi_text(),
         "picture-set.schema.json": documents.schema_text(documents.PictureSet),

@@ -25,7 +25,7 @@ class JobView(_View):
 
     id: str
     number: int = Field(description="counts jobs in the order of their creation")
-    kind: str = Field(description="what it does: calibrate, publish ...")
+    kind: str = Field(description="what it does: calibrate, publish, recheck")
     state: JobState
     reason: str | None = Field(description="why it failed or was cancelled")
     lens: str

@@ -21,6 +21,7 @@ from app.cli.doctor import doctor
 from app.cli.exports import export_table, import_table
 from app.cli.plot import plot
 from app.cli.publish import publish
+from app.cli.recheck import recheck
 from app.cli.run import run
 from app.cli.serve import serve
 from app.cli.simulate import simulate
@@ -132,6 +133,13 @@ cli.command(
         "lensmatch publish table.json --zoom 0.5 --focus 0.25 --all-levels --room job.json",
     ),
 )(publish)
+cli.command(
+    rich_help_panel=_TABLES,
+    epilog=_examples(
+        "lensmatch recheck table.json --studio studio.toml --room job.json",
+        "lensmatch recheck table.json --room job.json --at 0.1,0.5 --at 0.9,0.5 --out corrected.json",
+    ),
+)(recheck)
 cli.command(
     rich_help_panel=_STUDIO, epilog=_examples("lensmatch serve", "lensmatch serve --port 8080 --profile studio.toml")
 )(serve)

@@ -74,6 +74,10 @@ _DOCUMENTS = {
     '"limit_px":, "reason":, "ok":}], "job":}`, `null` what is not told; a publication that failed has `"error":` '
     "besides",
     "`plot`": '`{"out":, "kind":}`',
+    "`recheck`": '`{"verdict": "holds", "corrected" or "changed", "goal_px":, "error_px":, "left_px":, "remount": '
+    '{"center_shift_px":, "center_shift_sigma_px":, "zoom_offset":, "zoom_offset_sigma":, "focus_offset":, '
+    '"focus_offset_sigma":}, "levels": [{"zoom":, "focus":, "error_px":, "expected_px":, "left_px":}], '
+    '"corrected_table_id":, "reason":, "job":}`, `null` what is not told; `changed` is exit code 1 without `"error":`',
     "`export`": '`{"out":, "format":, "cannot_carry": [...]}`',
     "`serve`": '`{"url":, "pid":, "database":}` when it is ready',
     "`simulate`": "one line with the addresses `r3`, `mockboard`, `head`, and `pid`, `lens`, `room`, `projects`, "

@@ -27,17 +27,19 @@ from app.jobs.engine import learn
 from app.jobs.evidence import evidence_or_none
 from app.jobs.level import LevelOutcome, LevelRun
 from app.jobs.pictures import level_pictures
+from app.jobs.prior import prior_surface, require_prior
 from app.jobs.provenance import provenance_of_job
 from app.jobs.sweep import LevelPlan, SweepPlan, level_task
 from app.jobs.taking import PictureTaker
 from app.jobs.work import HOME_BOUND_S, Ending, JobTools, JobWorkFailed, Subject
-from app.lens_at import SURFACE_KIND, surface_fit
+from app.lens_at import SURFACE_KIND, completed_from, surface_fit
 from calibration.compare import Overlay, predicted_overlay
 from calibration.errors import CalibrationError
 from calibration.solve.alternating import AlternatingMethod
 from calibration.solve.engine_model import Direction, EngineModel
 from calibration.solve.joint import JointMethod, JointOptions
 from calibration.solve.search import LevelMethod, LevelTask
+from calibration.surface import LensSurface
 from calibration.surface.plan import AdaptivePlan
 from calibration.tables import Interpolation, LensTable, LevelResult, LevelStatus
 from calibration.types import TargetKind
@@ -117,11 +119,12 @@ def subject(request: JobRequest) -> Subject:
     return Subject(request.lens, request.camera, request.method, len(request.levels), pictures)
 
 
-def make_plan(request: JobRequest) -> LevelPlan:
+def make_plan(request: JobRequest, prior: LensSurface | None = None) -> LevelPlan:
     """The plan that a job asks for: which levels, in which order."""
     if request.plan is None:
         return SweepPlan([(level.zoom, level.focus) for level in request.levels])
-    return AdaptivePlan(request.plan.to_options(), request.image_size, request.pixel_aspect)
+    known = None if prior is None else prior.quantities
+    return AdaptivePlan(request.plan.to_options(), request.image_size, request.pixel_aspect, known)
 
 
 def _held_out(table: LensTable) -> tuple[LensTable, list[str]]:
@@ -137,12 +140,19 @@ def _held_out(table: LensTable) -> tuple[LensTable, list[str]]:
 class Calibration:
     """The work (:class:`app.jobs.work.JobWork`) of a calibration job."""
 
-    def __init__(self, request: JobRequest, tools: JobTools) -> None:
+    def __init__(self, request: JobRequest, tools: JobTools, prior: LensSurface | None = None) -> None:
+        """``prior``: the lens that levels start from, None: as the request says."""
         self._request = request
         self._tools = tools
+        self._prior = prior
         self._results: list[LevelResult] = []
         self._attempts: dict[tuple[float, float], int] = {}
         self._drawing = _Background()
+
+    @property
+    def results(self) -> tuple[LevelResult, ...]:
+        """The levels measured so far, failed ones too."""
+        return tuple(self._results)
 
     async def run(self, lease: Lease) -> None:
         """Measure the levels that the plan asks for."""
@@ -154,6 +164,8 @@ class Calibration:
 
     async def _measure(self, lease: Lease) -> None:
         request, tools = self._request, self._tools
+        if self._prior is None:
+            self._prior = await prior_surface(request, tools.repository)
         as_found = await _lens_as_found(lease.studio.engine)
         taker = PictureTaker(lease.studio, request.image_size, tools.cpu)
         stood = await taker.read_head()
@@ -161,7 +173,7 @@ class Calibration:
         delay_ms, picture_ms = taker.delay.delay_s * 1e3, taker.delay.picture_s * 1e3
         text = f"the output follows a change after at most {delay_ms:.0f} ms; a picture takes {picture_ms:.0f} ms"
         await tools.event(Note(text=text))
-        plan = make_plan(request)
+        plan = make_plan(request, self._prior)
         asked = await tools.cpu.run(plan.ask)
         model = await self._learn(lease.studio, taker, asked[0])
         told, failures = len(request.levels), 0
@@ -176,6 +188,9 @@ class Calibration:
                     left = known - len(self._results)
                     raise EngineError(f"{problem} ({failures} levels in a row failed so; {left} levels were not tried)")
                 result, problem = await self._one(zoom, focus, model, taker, lease, as_found)
+                if self._prior is not None and problem is None and result.status is LevelStatus.FAILED:
+                    # Perhaps it is another lens than the table's: once more, without it.
+                    result, problem = await self._one(zoom, focus, model, taker, lease, as_found)
                 failures = failures + 1 if problem is not None else 0
                 await tools.cpu.run(plan.tell, result)
             asked = await tools.cpu.run(plan.ask)
@@ -204,7 +219,7 @@ class Calibration:
         ordinal = places.index((zoom, focus)) if attempt > 1 else len(self._results)
         await self._tools.event(LevelStarted(ordinal=ordinal, zoom=zoom, focus=focus, attempt=attempt))
         others = [result for result in self._results if (result.zoom, result.focus) != (zoom, focus)]
-        task = level_task(request, zoom, focus, others, model)
+        task = level_task(request, zoom, focus, others, model, self._prior if attempt == 1 else None)
         method = make_method(request, task)
         outcome, problem = await self._level(ordinal, method, task, taker, lease)
         outcome, evidence = await self._tools.cpu.run(_with_evidence, outcome, method, task)
@@ -310,6 +325,11 @@ class Calibration:
             pixel_aspect=request.pixel_aspect,
             provenance=provenance_of_job(self._tools.job_id, levels, self._tools.profile),
         )
+        if request.plan is not None and (prior := await require_prior(request, self._tools.repository)) is not None:
+            try:
+                table = await self._tools.cpu.run(completed_from, table, prior)
+            except CalibrationError as error:
+                await self._tools.event(Note(text=f"nothing was taken over from the table started from: {error}"))
         table, told = await self._tools.cpu.run(_held_out, table)
         for text in told:
             await self._tools.event(Note(text=text))

@@ -9,6 +9,7 @@ from app.documents import JobRequest
 from calibration.lens import Lens
 from calibration.solve.engine_model import IDENTITY, EngineModel
 from calibration.solve.search import LevelTask
+from calibration.surface import LensSurface
 from calibration.surface.plan import in_order
 from calibration.tables import LevelResult, LevelStatus
 
@@ -71,14 +72,26 @@ def last_measured(done: Sequence[LevelResult], request: JobRequest) -> Lens | No
 
 
 def level_task(
-    request: JobRequest, zoom: float, focus: float, done: Sequence[LevelResult], engine: EngineModel = IDENTITY
+    request: JobRequest,
+    zoom: float,
+    focus: float,
+    done: Sequence[LevelResult],
+    engine: EngineModel = IDENTITY,
+    prior: LensSurface | None = None,
 ) -> LevelTask:
     """What a method must know of one level of a job, after the levels ``done``, on an engine that draws so.
 
     Once a level has shown that the pupil is not where the job says, no later one may take it to be there: the nodal
-    offset then starts from the level measured last, as a prior.
+    offset then starts from the level measured last, as a prior. ``prior``: the lens as another table has it; it is the
+    guess where no level of the job is a better one, and its nodal offset stands where the job states none.
     """
     nodal = [result.nodal_offset_mm for result in done if result.nodal_offset_mm is not None]
+    guess, stated_mm = guess_from(done, zoom, request), request.nodal_offset_mm
+    if prior is not None:
+        known = prior.at(zoom, focus)
+        guess = guess or known.lens
+        if known.nodal_told and stated_mm == 0 and request.nodal_sigma_mm == 0:
+            stated_mm = known.lens.nodal_offset_mm
     return LevelTask(
         zoom=zoom,
         focus=focus,
@@ -90,9 +103,9 @@ def level_task(
         angle_sigma_deg=request.angle_sigma_deg,
         roll_sigma_deg=request.roll_sigma_deg,
         priors=request.priors.to_priors(),
-        nodal_offset_mm=nodal[-1] if nodal else request.nodal_offset_mm,
+        nodal_offset_mm=nodal[-1] if nodal else stated_mm,
         nodal_sigma_mm=max(_NODAL_CHANGE_MM, request.nodal_sigma_mm) if nodal else request.nodal_sigma_mm,
-        guess=guess_from(done, zoom, request),
+        guess=guess,
         neighbour=last_measured(done, request),
         engine=engine,
     )

@@ -18,6 +18,7 @@ from app.errors import TooManyListeners
 from calibration.lens import Lens
 from calibration.solve.engine_fit import LearnedEngine
 from calibration.solve.engine_model import EngineModel
+from calibration.surface.recheck import LevelAgreement, Recheck, Remount, Verdict
 from calibration.tables import Frames, LevelResult, PixelError
 from storage.records import EventRecord
 
@@ -59,6 +60,20 @@ SAMPLES: list[events.AnyEvent] = [
         ok=True,
     ),
     events.Published(engine="default", table_id=3, zoom=0.5, focus=1.0, kept=True, compared=True, places=1),
+    events.Rechecked.of(
+        "default",
+        3,
+        Recheck(
+            Verdict.CORRECTED,
+            1.0,
+            4.1,
+            0.1,
+            (LevelAgreement(0.5, 1.0, 4.1, 0.2, 0.1),),
+            Remount((4.0, -1.0), (0.1, 0.1)),
+            "a remount explains it",
+        ),
+        None,
+    ),
     events.EngineRestored(engine="default"),
     events.EngineDirty(engine="default", reason="the engine is gone"),
     events.JobDone(table_id=7),
