@@ -53,7 +53,7 @@ def test_a_table_of_few_levels_is_completed_from_a_lens_of_its_type() -> None:
     assert "not measured" in whole.levels[1].reasons["residual_px"]
     surface = surface_fit(whole).surface
     worst = max(overlay(true_lens(z, 1.004), surface.at(z, 0.5).lens).max_px for z in np.linspace(0, 1, 21).tolist())
-    assert worst < 0.5
+    assert worst < 1.0
     assert worst < 0.05 * max(
         overlay(true_lens(z, 1.004), surface_fit(few).surface.at(z, 0.5).lens).max_px
         for z in np.linspace(0, 1, 21).tolist()
