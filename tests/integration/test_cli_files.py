@@ -342,7 +342,8 @@ def test_one_place_of_a_table_is_exported(tmp_path: Path) -> None:
     assert exported("--zoom", "0", "--focus", "0.5") == [(0.0, 0.5)]
     words = ("export", source, "--format", "csv", "--out", out)
     assert "no level has this zoom; the table has zoom 0, 1" in reason(invoke(*words, "--zoom", "0.3"))
-    assert "the table has zoom / focus 0 / 0, 0 / 0.5, 1 / 0.5" in reason(invoke(*words, "--zoom", "1", "--focus", "0"))
+    assert exported("--zoom", "0.4", "--focus", "0.2") == [(0.4, 0.2)]
+    assert "outside the table's levels" in reason(invoke(*words, "--zoom", "0.4", "--focus", "0.9"))
 
 
 def test_st_maps_have_options_of_their_own(tmp_path: Path) -> None:

@@ -260,9 +260,18 @@ async def test_a_target_that_is_not_there_publishes_nothing(tmp_path: Path) -> N
         assert await b.engine_values() == found
 
 
-async def test_a_place_between_levels_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+async def test_between_levels_the_surface_is_published_and_its_render_agrees(tmp_path: Path) -> None:
     async with publishing(tmp_path) as b:
-        last, events, _ = await b.publish(b.request(zoom=0.4))
+        last, _, result = await b.publish(b.request(zoom=0.45))
+        assert last.kind == "job_done", last.data
+        assert result.kept
+        assert result.render_px is not None
+        assert result.render_px.max < 0.15
+
+
+async def test_a_place_outside_the_levels_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    async with publishing(tmp_path) as b:
+        last, events, _ = await b.publish(b.request(focus=1.0))
         assert last.kind == "job_failed"
         assert "outside the table's levels" in last.data["reason"]
         assert "level_started" not in [event.kind for event in events]
