@@ -130,7 +130,7 @@ def read_table(
 ) -> LensTable:
     """The table of a file's levels, with the file's hash as its provenance. ``note``: what was done to its numbers.
     Raises :class:`BadDocument`."""
-    told = f"read from a file: {carrier}" + (f"; {note}" if note else "")
+    told = f"read from a {carrier} file" + (f"; {note}" if note else "")
     provenance = Provenance("imported", software, inputs_sha256=hashlib.sha256(data).hexdigest(), note=told)
     try:
         return LensTable(
