@@ -64,7 +64,10 @@ async def test_every_refusal_is_a_problem(client: httpx.AsyncClient, method: str
     [
         ({"lens": ""}, "body.lens"),
         ({"lenz": "XA"}, "body.lenz"),
-        ({"levels": []}, "body.levels"),
+        ({"levels": []}, "body"),
+        ({"plan": {}}, "body"),
+        ({"levels": [], "plan": {"max_levels": 1}}, "body.plan.max_levels"),
+        ({"levels": [], "plan": {"zoom_range": [0.5, 0.5]}}, "body.plan"),
         ({"levels": [{"zoom": 2.0, "focus": 0.0}]}, "body.levels.0.zoom"),
         ({"levels": [{"zoom": 0.0, "focus": 0.0}] * 2}, "body"),
         ({"targets": {"board": {"kind": "circle"}}}, "body.targets.board.kind"),

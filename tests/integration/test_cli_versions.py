@@ -110,7 +110,7 @@ def test_one_json_document(tmp_path: Path) -> None:
     told = json.loads(result.stdout)
     assert ComparisonDocument.model_validate(told).model_dump(mode="json") == told
     assert [level["measured"] for level in told["levels"]] == [[True, False], [True, True]]
-    assert told["levels"][0]["reason"] == "in the second table it is no level with a lens"
+    assert told["levels"][0]["reason"] == "in the second table it lies outside the levels"
     assert told["difference_px"]["max"] == pytest.approx(0.2)
     shown = invoke("compare", *written(tmp_path, first, second))
     assert "zoom 0.000, focus 0.00: not compared, in the second table" in shown.stderr
