@@ -34,6 +34,8 @@ FEWEST_TO_JUDGE = 6
 
 _MOST_LEFT_OUT = 0.25
 _SUSPECTS = 3
+_RARER = 0.01
+# Each further wrong level of a table is so much less likely; beside one left out, an end of the range is extrapolated.
 _ARRIVED = 0.05
 # Chance above which a level is taken to fit at another zoom.
 _ELSEWHERE = 0.01
@@ -116,7 +118,8 @@ def find_outliers(data: LevelData, prior: PriorMean | None) -> dict[int, tuple[L
             chance = chance_of(found, others.spare)
             if worst is None or chance < worst[0]:
                 worst = (chance, level, others, found)
-        if worst is None or worst[0] >= REJECTED_CHANCE / len(data) or worst[3].error_px < HARMLESS_PX:
+        needed = REJECTED_CHANCE / len(data) * _RARER ** len(dropped)
+        if worst is None or worst[0] >= needed or worst[3].error_px < HARMLESS_PX:
             return dropped
         chance, level, others, found = worst
         dropped[level] = (found, chance, _explain(others, data, level, found))

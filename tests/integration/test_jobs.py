@@ -150,7 +150,7 @@ async def test_a_plan_may_ask_for_more_levels_than_the_job_lists(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = GrowingPlan()
-    monkeypatch.setattr(calibrating, "make_plan", lambda request: plan)
+    monkeypatch.setattr(calibrating, "make_plan", lambda *arguments: plan)
     async with bench(tmp_path / "jobs.db") as b:
         record = await b.service.runner.submit(b.job((0.5, 0.25)))
         planned = await b.until(record.id, "levels_planned")
