@@ -229,7 +229,10 @@ def _files(data: bytes) -> Iterator[tuple[str, bytes]]:
                 with archive.open(entry) as file:
                     yield repr(entry.filename[:80]), file.read(entry.file_size)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError) as error:
-        raise BadDocument("", "is a damaged ZIP, or one with a password", _AGAIN) from error
+        # zipfile says by RuntimeError that a file has a password, by NotImplementedError that it is packed in a way that
+        # it does not know.
+        why = "is a damaged ZIP, or one with a password or of an unknown packing"
+        raise BadDocument("", why, _AGAIN) from error
 
 
 def _note_of(picture: MapPicture, place: str) -> _Note:
