@@ -229,8 +229,8 @@ def _files(data: bytes) -> Iterator[tuple[str, bytes]]:
                 with archive.open(entry) as file:
                     yield repr(entry.filename[:80]), file.read(entry.file_size)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError) as error:
-        # zipfile says by RuntimeError that a file has a password, by NotImplementedError that it is packed in a way that
-        # it does not know.
+        # zipfile says by RuntimeError that a file has a password, by NotImplementedError that it does not know how
+        # a file is packed.
         why = "is a damaged ZIP, or one with a password or of an unknown packing"
         raise BadDocument("", why, _AGAIN) from error
 
